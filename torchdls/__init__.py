@@ -1,0 +1,85 @@
+"""Surfaces from gradients in PyTorch: DLS and its peers, batched and differentiable.
+
+Every public name imports from here. Names load their module on first use, so that ``import torchdls`` and
+``torchdls --help`` answer at once.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal to the table below
+    from torchdls.dictionary import dct_dictionary as dct_dictionary
+    from torchdls.dictionary import soup_dil_sweep as soup_dil_sweep
+    from torchdls.geometry import GradientToNormals as GradientToNormals
+    from torchdls.geometry import NormalsToGradient as NormalsToGradient
+    from torchdls.geometry import gradient_to_normals as gradient_to_normals
+    from torchdls.geometry import normals_to_gradient as normals_to_gradient
+    from torchdls.integrators import DLS as DLS
+    from torchdls.integrators import INTEGRATORS as INTEGRATORS
+    from torchdls.integrators import Integrator as Integrator
+    from torchdls.integrators import LeastSquares as LeastSquares
+    from torchdls.integrators import dls_objective as dls_objective
+    from torchdls.metrics import mean_angular_error as mean_angular_error
+    from torchdls.metrics import rmse as rmse
+    from torchdls.metrics import ssim as ssim
+    from torchdls.noise import noise_level as noise_level
+    from torchdls.operators import GradientOperator as GradientOperator
+    from torchdls.operators import Patches as Patches
+    from torchdls.operators import dct2 as dct2
+    from torchdls.operators import edge_slopes as edge_slopes
+    from torchdls.operators import idct2 as idct2
+    from torchdls.solvers import ConvergenceWarning as ConvergenceWarning
+    from torchdls.solvers import SolveResult as SolveResult
+    from torchdls.solvers import solve as solve
+    from torchdls.surfaces import SURFACES as SURFACES
+    from torchdls.surfaces import add_noise as add_noise
+
+__version__ = "0.1.0"
+
+_MODULE_OF = {
+    # integrators
+    "DLS": "integrators",
+    "INTEGRATORS": "integrators",
+    "Integrator": "integrators",
+    "LeastSquares": "integrators",
+    "dls_objective": "integrators",
+    # the parts they are made of
+    "GradientOperator": "operators",
+    "Patches": "operators",
+    "dct2": "operators",
+    "edge_slopes": "operators",
+    "idct2": "operators",
+    "ConvergenceWarning": "solvers",
+    "SolveResult": "solvers",
+    "solve": "solvers",
+    "dct_dictionary": "dictionary",
+    "soup_dil_sweep": "dictionary",
+    # in and out
+    "GradientToNormals": "geometry",
+    "NormalsToGradient": "geometry",
+    "gradient_to_normals": "geometry",
+    "normals_to_gradient": "geometry",
+    # data and measures
+    "SURFACES": "surfaces",
+    "add_noise": "surfaces",
+    "mean_angular_error": "metrics",
+    "noise_level": "noise",
+    "rmse": "metrics",
+    "ssim": "metrics",
+}
+
+__all__ = ["__version__", *_MODULE_OF]
+
+
+if not TYPE_CHECKING:  # else every misspelt name would pass the type checker as Any
+
+    def __getattr__(name: str) -> Any:
+        if name not in _MODULE_OF:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+        globals()[name] = value  # the next use does not come here
+        return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULE_OF})
