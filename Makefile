@@ -1,0 +1,78 @@
+# make demo   noisy slopes to surfaces: pictures, a page, meshes and a table in demo/
+# make test   the tests
+# make check  everything that CI runs
+#
+# Each makes .venv if it is missing and installs what it needs. To choose where and what:
+#   PYTHON=python3.12   the interpreter that makes .venv
+#   TORCH=torch         another PyTorch; '' leaves the choice to pip
+#   TORCH_INDEX=URL     an index to look into besides the usual one, such as
+#                       https://download.pytorch.org/whl/cpu for the small build without CUDA
+
+PYTHON ?= python3
+VENV ?= .venv
+TORCH ?= torch==2.13.0
+TORCH_INDEX ?=
+JOBS ?= 2
+DEMO ?= demo
+PYTEST_ARGS ?=
+
+BIN := $(VENV)/bin
+PIP_INSTALL := $(BIN)/python -m pip install --quiet $(addprefix --extra-index-url ,$(TORCH_INDEX)) $(TORCH)
+SCRATCH := build
+
+# Benchmarks are pytest files (bench_*.py) and scripts that take --smoke; a leading underscore marks a helper.
+BENCH_TESTS := $(wildcard benchmarks/bench_*.py benchmarks/test_*.py)
+BENCH_SCRIPTS := $(filter-out $(BENCH_TESTS) benchmarks/conftest.py benchmarks/_%,$(wildcard benchmarks/*.py))
+NOTEBOOKS := $(patsubst notebooks/%.py,%,$(wildcard notebooks/*.py))
+
+.PHONY: help demo test lint format types notebooks notebooks-update bench-smoke check clean
+.DELETE_ON_ERROR:
+
+help:
+	@sed -n '/^#/!q;s/^# \{0,1\}//p' $(MAKEFILE_LIST)
+
+demo: $(VENV)/.demo
+	$(BIN)/torchdls demo --out $(DEMO)
+
+test: $(VENV)/.dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: $(VENV)/.dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+types: $(VENV)/.dev
+	$(BIN)/mypy
+
+# Runs every notebook from its source, into a scratch folder; a cell that fails stops it.
+notebooks: $(VENV)/.dev
+	@mkdir -p $(SCRATCH)/notebooks
+	@set -e; for name in $(NOTEBOOKS); do echo "notebook $$name"; \
+	$(BIN)/jupytext --quiet --to ipynb --execute --output $(SCRATCH)/notebooks/$$name.ipynb notebooks/$$name.py; done
+
+# Runs them and keeps the result beside the source.
+notebooks-update: notebooks
+	@for name in $(NOTEBOOKS); do cp $(SCRATCH)/notebooks/$$name.ipynb notebooks/$$name.ipynb; done
+
+bench-smoke: $(VENV)/.dev
+	$(if $(BENCH_TESTS),$(BIN)/python -m pytest --benchmark-disable --quiet $(BENCH_TESTS))
+	@set -e; for script in $(BENCH_SCRIPTS); do echo "$$script --smoke"; $(BIN)/python $$script --smoke; done
+
+check: test lint types notebooks bench-smoke
+
+clean:
+	rm -rf $(SCRATCH) $(DEMO) .mypy_cache .pytest_cache .ruff_cache
+
+$(VENV)/.demo: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(PIP_INSTALL) --editable ".[plots,files]"
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(PIP_INSTALL) --editable ".[dev]"
+	@touch $@ $(VENV)/.demo

@@ -1,0 +1,139 @@
+"""The house rules that a reader relies on: floors, public names, short files, nothing left over."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import torchdls
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "torchdls"
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+FOLDERS = ["torchdls", "tests", "benchmarks", "notebooks", "docs", ".ci"]
+
+# What each room may import. The floors, from the ground up; each may use all below it.
+FLOORS = ["operators", "solvers", "dictionary", "noise", "selection", "integrators"]
+MAY_IMPORT = {floor: set(FLOORS[:i]) for i, floor in enumerate(FLOORS)}
+# Rooms that stand beside them.
+MAY_IMPORT |= {
+    "geometry": {"operators"},
+    "surfaces": {"operators"},
+    "metrics": {"operators", "geometry"},
+    "photometric": {"operators", "geometry"},
+    "io": {"geometry"},
+    "plot": {"geometry", "metrics"},
+}
+
+
+def room(path: Path) -> str:
+    """The top-level module or package that a source file belongs to."""
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def imported_rooms(path: Path) -> set[str]:
+    """The rooms that a file imports, at its top or inside a function, by absolute or relative name."""
+    package = ["torchdls", *path.relative_to(PACKAGE).parts[:-1]]
+    rooms = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            modules = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = [*package[: len(package) + 1 - node.level]] if node.level else []
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            modules = [f"{module}.{alias.name}" for alias in node.names] if module == "torchdls" else [module]
+        else:
+            continue
+        rooms |= {name.split(".")[1] for name in modules if name.startswith("torchdls.")}
+    return rooms
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(PACKAGE).as_posix())
+def test_imports_point_downward(path: Path) -> None:
+    here = room(path)
+    if here in {"__init__", "__main__", "cli"}:  # the doors
+        return
+    # A module with a leading underscore is the ground that every room stands on, and imports none of them.
+    allowed = set() if here.startswith("_") else MAY_IMPORT[here] | {here}
+    wrong = {name for name in imported_rooms(path) if not name.startswith("_")} - allowed
+    assert not wrong, f"{here} may import {sorted(allowed)}, not {sorted(wrong)}"
+
+
+def test_import_reader_sees_every_form(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "solvers").mkdir()
+    file = tmp_path / "solvers" / "x.py"
+    file.write_text(
+        "import torchdls.cli\nfrom torchdls import io\nfrom torchdls.plot import f\nfrom ..noise import g\n"
+        "from .. import metrics\nfrom .y import h\nimport torch\n"
+    )
+    monkeypatch.setattr(sys.modules[__name__], "PACKAGE", tmp_path)
+    assert imported_rooms(file) == {"cli", "io", "plot", "noise", "metrics", "solvers"}
+
+
+@pytest.mark.parametrize("name", torchdls.__all__)
+def test_public_name_imports_and_is_described(name: str) -> None:
+    value = getattr(torchdls, name)
+    assert name in dir(torchdls)
+    if callable(value):
+        assert value.__doc__, f"{name} has no docstring"
+
+
+def test_type_checkers_see_the_same_public_names() -> None:
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    (block,) = [n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"]
+    seen = {
+        alias.name: (node.module or "").removeprefix("torchdls.")
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert seen == torchdls._MODULE_OF
+
+
+def test_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="'torchdls' has no attribute 'no_such_name'"):
+        torchdls.no_such_name  # noqa: B018
+
+
+def test_import_alone_does_not_load_torch() -> None:
+    code = "import sys, torchdls; dir(torchdls); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("folder", ["torchdls", "tests", "benchmarks"])
+def test_files_are_short(folder: str) -> None:
+    lengths = {p.name: len(p.read_text(encoding="utf-8").splitlines()) for p in (ROOT / folder).rglob("*.py")}
+    assert not {name: n for name, n in lengths.items() if n > 400}
+
+
+def matches(pattern: str, paths: list[Path]) -> list[str]:
+    """The lines of the files that match a pattern, as ``file:line: text``."""
+    return [
+        f"{path.relative_to(ROOT)}:{number}: {line.strip()[:100]}"
+        for path in paths
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if re.search(pattern, line)
+    ]
+
+
+def test_nothing_is_left_unfinished() -> None:
+    assert not matches(r"\b(TODO|FIXME|XXX|NotImplementedError)\b", SOURCES)
+
+
+def test_no_global_setting_is_changed() -> None:
+    settings = r"\btorch\.(manual_seed|seed|set_\w+|use_deterministic\w*)\(|\bnp\.random\.seed\("
+    assert not matches(settings, SOURCES)
+
+
+def test_no_path_of_one_machine() -> None:
+    files = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*")] + [*ROOT.glob("*")]
+    texts = [
+        path
+        for path in files
+        if path.suffix in {".py", ".md", ".toml", ".ipynb"} or path.name in {"Makefile", "run"}
+    ]
+    # Slashes inside a picture's base64 text do not match: a path begins a line or follows one of these.
+    assert not matches(r"(^|[\s\"'`=(:])/(home|root|Users|work|opt|tmp)/\w", texts)
