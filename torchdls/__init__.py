@@ -10,15 +10,23 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal to the table below
     from torchdls.dictionary import dct_dictionary as dct_dictionary
     from torchdls.dictionary import soup_dil_sweep as soup_dil_sweep
+    from torchdls.geometry import GradientField as GradientField
     from torchdls.geometry import GradientToNormals as GradientToNormals
     from torchdls.geometry import NormalsToGradient as NormalsToGradient
+    from torchdls.geometry import convert_gradient as convert_gradient
+    from torchdls.geometry import convert_normals as convert_normals
+    from torchdls.geometry import depth_to_points as depth_to_points
     from torchdls.geometry import gradient_to_normals as gradient_to_normals
+    from torchdls.geometry import guess_convention as guess_convention
+    from torchdls.geometry import height_to_points as height_to_points
+    from torchdls.geometry import log_depth_to_depth as log_depth_to_depth
     from torchdls.geometry import normals_to_gradient as normals_to_gradient
     from torchdls.integrators import DLS as DLS
     from torchdls.integrators import INTEGRATORS as INTEGRATORS
     from torchdls.integrators import Integrator as Integrator
     from torchdls.integrators import LeastSquares as LeastSquares
     from torchdls.integrators import dls_objective as dls_objective
+    from torchdls.metrics import made as made
     from torchdls.metrics import mean_angular_error as mean_angular_error
     from torchdls.metrics import rmse as rmse
     from torchdls.metrics import ssim as ssim
@@ -32,7 +40,10 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.solvers import SolveResult as SolveResult
     from torchdls.solvers import solve as solve
     from torchdls.surfaces import SURFACES as SURFACES
+    from torchdls.surfaces import Surface as Surface
     from torchdls.surfaces import add_noise as add_noise
+    from torchdls.surfaces import noise_sigma as noise_sigma
+    from torchdls.surfaces import terrain as terrain
 
 __version__ = "0.1.0"
 
@@ -54,18 +65,29 @@ _MODULE_OF = {
     "solve": "solvers",
     "dct_dictionary": "dictionary",
     "soup_dil_sweep": "dictionary",
-    # in and out
+    # normals, gradients, cameras
+    "GradientField": "geometry",
     "GradientToNormals": "geometry",
     "NormalsToGradient": "geometry",
+    "convert_gradient": "geometry",
+    "convert_normals": "geometry",
+    "depth_to_points": "geometry",
     "gradient_to_normals": "geometry",
+    "guess_convention": "geometry",
+    "height_to_points": "geometry",
+    "log_depth_to_depth": "geometry",
     "normals_to_gradient": "geometry",
     # data and measures
     "SURFACES": "surfaces",
+    "Surface": "surfaces",
     "add_noise": "surfaces",
+    "noise_sigma": "surfaces",
+    "terrain": "surfaces",
+    "made": "metrics",
     "mean_angular_error": "metrics",
-    "noise_level": "noise",
     "rmse": "metrics",
     "ssim": "metrics",
+    "noise_level": "noise",
 }
 
 __all__ = ["__version__", *_MODULE_OF]
