@@ -131,9 +131,7 @@ def test_no_global_setting_is_changed() -> None:
 def test_no_path_of_one_machine() -> None:
     files = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*")] + [*ROOT.glob("*")]
     texts = [
-        path
-        for path in files
-        if path.suffix in {".py", ".md", ".toml", ".ipynb"} or path.name in {"Makefile", "run"}
+        path for path in files if path.suffix in {".py", ".md", ".toml", ".ipynb"} or path.name in {"Makefile", "run"}
     ]
     # Slashes inside a picture's base64 text do not match: a path begins a line or follows one of these.
     assert not matches(r"(^|[\s\"'`=(:])/(home|root|Users|work|opt|tmp)/\w", texts)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.geometry import normals_to_gradient as normals_to_gradient
     from torchdls.integrators import DLS as DLS
     from torchdls.integrators import INTEGRATORS as INTEGRATORS
+    from torchdls.integrators import DLSResult as DLSResult
     from torchdls.integrators import Integrator as Integrator
     from torchdls.integrators import LeastSquares as LeastSquares
     from torchdls.integrators import dls_objective as dls_objective
@@ -50,6 +51,7 @@ __version__ = "0.1.0"
 _MODULE_OF = {
     # integrators
     "DLS": "integrators",
+    "DLSResult": "integrators",
     "INTEGRATORS": "integrators",
     "Integrator": "integrators",
     "LeastSquares": "integrators",
