@@ -67,12 +67,10 @@ check: test lint types notebooks bench-smoke
 clean:
 	rm -rf $(SCRATCH) $(DEMO) .mypy_cache .pytest_cache .ruff_cache
 
-$(VENV)/.demo: pyproject.toml
-	$(PYTHON) -m venv $(VENV)
-	$(PIP_INSTALL) --editable ".[plots,files]"
+$(VENV)/.demo: EXTRAS := plots,files
+$(VENV)/.dev: EXTRAS := dev
+$(VENV)/.demo $(VENV)/.dev: pyproject.toml
+	@echo "Installing torchdls[$(EXTRAS)] into $(VENV): a minute or more"
+	@$(PYTHON) -m venv $(VENV)
+	$(PIP_INSTALL) --editable ".[$(EXTRAS)]"
 	@touch $@
-
-$(VENV)/.dev: pyproject.toml
-	$(PYTHON) -m venv $(VENV)
-	$(PIP_INSTALL) --editable ".[dev]"
-	@touch $@ $(VENV)/.demo
