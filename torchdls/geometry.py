@@ -38,7 +38,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchdls.operators.gradient import as_pixel_size
+from torchdls.operators import as_pixel_size
 
 # Canonical component k is sign * source[index], (index, sign) = table[name][k]: frames are signed permutations.
 _Axes = tuple[tuple[int, int], ...]
@@ -162,8 +162,8 @@ def normals_to_gradient(
     inside = visible if mask is None else visible & mask
     # The safe denominator comes before the division: masking afterwards would multiply inf by 0 in the backward pass.
     gradient = torch.where(inside, numerators, 0) / torch.where(inside, c, 1)
-    asked = ~visible if mask is None else mask & ~visible
-    return GradientField(gradient, inside, asked.sum((-3, -2, -1)))
+    blind = ~visible if mask is None else ~visible & mask
+    return GradientField(gradient, inside, blind.sum((-3, -2, -1)))
 
 
 def gradient_to_normals(
@@ -184,9 +184,7 @@ def gradient_to_normals(
         pixel_size: spacing (dx, dy) if the gradient is the rise per pixel; 1 if it is a slope without unit.
 
     Returns:
-        (N, 3, H, W), of length 1; NaN where the gradient is NaN.
-
-    Raises as `normals_to_gradient` does.
+        (N, 3, H, W), of length 1; NaN where the gradient is NaN. Raises as `normals_to_gradient` does.
     """
     _check_field("gradient", gradient, 2)
     axes = _lookup(NORMAL_CONVENTIONS, "convention", convention)
@@ -266,9 +264,8 @@ def guess_convention(
 
         residual = sum |D_x g_y - D_y g_x| / sum (|D_x g_y| + |D_y g_x|)
 
-    A file alone does not tell OpenGL from DirectX; this can, as far as the surface is twisted (z_xy is not 0).
-    Residuals that are close to each other mean that the data does not tell. No convention that differs by the sign
-    of the height alone can be told apart.
+    This tells OpenGL from DirectX as far as the surface is twisted (z_xy is not 0); residuals close to each other mean
+    that the data does not tell. Readings that differ by the sign of the height alone can never be told apart.
 
     Args:
         normals: (N, 3, H, W) or (3, H, W).
