@@ -1,0 +1,375 @@
+"""DLS: integration regularised by a dictionary that is learned from the patches of the surface itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchdls.dictionary import dct_dictionary, soup_dil_sweep
+from torchdls.dictionary.soup_dil import Order, Unused
+from torchdls.integrators.base import Fields, Integrator
+from torchdls.integrators.least_squares import LeastSquares
+from torchdls.noise import noise_level
+from torchdls.operators import GradientOperator, Patches
+from torchdls.solvers import harmonic_extension, solve
+
+# Found by benchmarks/quality.py: lam is a plateau from here on, mu is in units of the noise of one gradient sample.
+_AUTO_LAM = 0.5
+_AUTO_MU = 1.5
+
+Callback = Callable[[int, Tensor], None]
+
+
+class DLSResult(NamedTuple):
+    """What `DLS.solve` returns; always batched.
+
+    Attributes:
+        height: (N, 1, H, W).
+        dictionary: (N, n, K), or (1, n, K) if shared or fixed; unit-norm atoms.
+        codes: (N, K, L), in units of height.
+        objective: (N, n_iter + 1), from the start (B = 0) on, for heights in pixels.
+        noise: (N,) estimated standard deviation of one gradient sample.
+        lam: (N,) the regularisation weight used.
+        mu: (N,) the threshold used, for heights in pixels.
+        converged: (N,) bool, whether the height settled to `tol` before the iterations ran out.
+    """
+
+    height: Tensor
+    dictionary: Tensor
+    codes: Tensor
+    objective: Tensor
+    noise: Tensor
+    lam: Tensor
+    mu: Tensor
+    converged: Tensor
+
+
+class DLS(Integrator):
+    r"""Dictionary learning on surfaces.
+
+        min over z, B, D   data(z) + lam ( \sum_j ||P_j z - D b_j||^2 + mu^2 ||B||_0 ),   ||d_i|| = 1, |b_ji| <= bound
+
+    with data(z) = 1/2 ||A z - v||^2 by default. From the height of the data term alone and B = 0, every iteration
+    sweeps over the codes and atoms of all overlapping patches (`soup_dil_sweep`) and then solves for the height,
+    where the patches act as an anchor: lam \sum_j ||P_j z - D b_j||^2 = 1/2 \sum_i r_i (z_i - a_i)^2 + const, with r
+    = 2 lam c, a = fold(D B) / c and c the number of patches that hold a pixel.
+
+    `lam` and `mu` refer to heights measured in pixels (h = sqrt(dx dy)), so they mean the same at every pixel size.
+
+    With a mask, the fit counts valid pixels only. Invalid pixels of a patch are filled before each sweep by the patch's
+    current approximation D b_j, which majorises that cost, so the objective still never rises; before the first
+    sweep, by the harmonic extension of the height. Patches without a valid pixel are left out. Nothing outside the
+    mask is read.
+
+    Args:
+        patch_size: rows and columns of a patch, or one number for both.
+        stride: step between patches, at most the patch size.
+        n_atoms: K, the number of atoms of the initial DCT dictionary; ignored if `dictionary` is given.
+        lam: weight of the patch model; a number, a tensor (a number or one per surface), or "auto" (0.5).
+        mu: threshold on the codes; a number, a tensor (a number or one per surface), or "auto": 1.5 times the noise
+        level
+            of one gradient sample, which `noise_level` estimates from the non-integrable part of each field.
+        n_iter: limit of iterations.
+        data_term: an integrator built on the solve (*), which provides the data term and the first height.
+        dictionary: initial dictionary (n, K), or (N, n, K) for each surface of a batch; atoms are brought to unit
+        norm. An
+            `nn.Parameter` is trained with the module, a tensor is a buffer. None for `dct_dictionary(patch_size,
+            n_atoms)`.
+        z_step: "exact" solves for the height; "proximal" takes `n_prox` proximal gradient steps as in the paper, with
+            tau = 1 / ||A||^2 (1/8 for unit weights and square pixels).
+        order: order of the sweep, "atom" (the paper's) or "block".
+        learn: "each" learns a dictionary per surface, "shared" one for the batch, "fixed" updates the codes alone.
+        n_sweeps: sweeps per iteration.
+        n_prox: proximal gradient steps per iteration.
+        bound: bound a on the codes, for heights in pixels.
+        unused: rule for atoms that no patch uses, "first" or "keep" (see `soup_dil_sweep`).
+        tol: a surface stops once a step moves its height by less than `tol` times the whole way from the first height;
+            0 runs all iterations.
+        z_tol: relative residual of the exact z-step.
+        pixel_size: (dx, dy) or one number; heights come out in its unit.
+
+    Raises:
+        ValueError: an option is unknown or out of range, or the dictionary does not fit the patches.
+        TypeError: `data_term` is not an integrator.
+
+    Source: Wagenmaker, Moore, Nadakuditi, "Robust surface reconstruction from gradients via adaptive dictionary
+    regularization", ICIP 2017.
+    """
+
+    def __init__(
+        self,
+        patch_size: int | tuple[int, int] = 8,
+        stride: int | tuple[int, int] = 2,
+        n_atoms: int = 64,
+        lam: float | Tensor | Literal["auto"] = "auto",
+        mu: float | Tensor | Literal["auto"] = "auto",
+        n_iter: int = 100,
+        data_term: Integrator | None = None,
+        dictionary: Tensor | None = None,
+        z_step: Literal["exact", "proximal"] = "exact",
+        order: Order = "atom",
+        *,
+        learn: Literal["each", "shared", "fixed"] = "each",
+        n_sweeps: int = 1,
+        n_prox: int = 1,
+        bound: float = math.inf,
+        unused: Unused = "first",
+        tol: float = 1e-3,
+        z_tol: float = 1e-6,
+        pixel_size: float | Sequence[float] = 1.0,
+    ) -> None:
+        super().__init__(pixel_size=pixel_size)
+        self.patches = Patches(patch_size, stride)
+        self.data_term = LeastSquares() if data_term is None else data_term
+        if not isinstance(self.data_term, Integrator):
+            raise TypeError(f"DLS: data_term is a {type(data_term).__name__}, an Integrator is needed")
+        if not self.data_term.quadratic:
+            raise ValueError(f"DLS: data_term {type(data_term).__name__} is not built on the weighted solve")
+        for name, value, known in (
+            ("z_step", z_step, ("exact", "proximal")),
+            ("order", order, ("atom", "block")),
+            ("learn", learn, ("each", "shared", "fixed")),
+            ("unused", unused, ("first", "keep")),
+        ):
+            if value not in known:
+                raise ValueError(f"DLS: {name}={value!r} is unknown; choose from {', '.join(map(repr, known))}")
+        for name, number, least in (("n_iter", n_iter, 0), ("n_sweeps", n_sweeps, 1), ("n_prox", n_prox, 1)):
+            if not isinstance(number, int) or number < least:
+                raise ValueError(f"DLS: {name}={number!r} given, an integer of at least {least} is needed")
+        if not bound > 0 or not tol >= 0 or not z_tol > 0:
+            raise ValueError(f"DLS: bound={bound!r} and z_tol={z_tol!r} must be positive, tol={tol!r} not negative")
+        self.lam = _parameter("lam", lam)
+        self.mu = _parameter("mu", mu)
+        self.n_iter, self.n_sweeps, self.n_prox = n_iter, n_sweeps, n_prox
+        self.z_step, self.order, self.learn, self.unused = z_step, order, learn, unused
+        self.bound, self.tol, self.z_tol = bound, tol, z_tol
+        initial = dct_dictionary(self.patches.size, n_atoms) if dictionary is None else dictionary
+        _check_dictionary(initial, self.patches)
+        if isinstance(initial, nn.Parameter):
+            self.dictionary = initial
+        else:
+            self.register_buffer("dictionary", initial.detach().clone())
+
+    def integrate(self, fields: Fields) -> Tensor:
+        """Height (N, 1, H, W) in pixels."""
+        return self._run(fields, None).height
+
+    def solve(
+        self,
+        gradient: Tensor,
+        mask: Tensor | None = None,
+        weight: Tensor | None = None,
+        anchor: Tensor | None = None,
+        anchor_weight: Tensor | float | None = None,
+        *,
+        callback: Callback | None = None,
+    ) -> DLSResult:
+        """Integrate as `forward` does, and tell everything that was found on the way.
+
+        Args:
+            gradient: see `forward`, and so for the mask, weight and anchors; a single field is a batch of one.
+            mask: see `forward`.
+            weight: see `forward`.
+            anchor: see `forward`.
+            anchor_weight: see `forward`.
+            callback: called after each iteration as callback(iteration, objective (N,)), with iterations from 1.
+
+        Returns:
+            DLSResult(height, dictionary, codes, objective, noise, lam, mu, converged).
+        """
+        result = self._run(self.check(gradient, mask, weight, anchor, anchor_weight), callback)
+        return result._replace(height=result.height * self.unit, codes=result.codes * self.unit)
+
+    def _run(self, fields: Fields, callback: Callback | None) -> DLSResult:
+        model = self._model(fields)
+        z = start = self.data_term.integrate(fields)
+        D = self._initial_dictionary(fields)
+        P = model.patches.extract(z)
+        B = P.new_zeros(P.shape[0], D.shape[-1], P.shape[-1])
+        fill = None if model.valid is None else model.patches.extract(_extend(z, fields))
+        objective = [self._objective(model, z, P, D, B)]
+        active = torch.ones_like(model.noise, dtype=torch.bool)
+        for iteration in range(1, self.n_iter + 1):
+            D_new, B_new = self._sweeps(model, P, D, B, fill)
+            E = D_new @ B_new
+            z_new = self._step(model, z, E)
+            settled = (z_new - z).flatten(1).norm(dim=1) <= self.tol * (z_new - start).flatten(1).norm(dim=1)
+            z = _choose(active, z_new, z)
+            B = _choose(active, B_new, B)
+            D = _choose(active, D_new, D) if D.shape[0] == len(active) else D_new
+            fill = E
+            P = model.patches.extract(z)
+            objective.append(self._objective(model, z, P, D, B))
+            if callback is not None:
+                callback(iteration, objective[-1].detach())
+            active = active & ~settled
+            if self.tol > 0 and not bool(active.any()):
+                break
+        objective += [objective[-1]] * (self.n_iter + 1 - len(objective))
+        return DLSResult(z, D, B, torch.stack(objective, 1), model.noise, model.lam, model.mu, ~active)
+
+    def _model(self, fields: Fields) -> _Model:
+        """Everything that stays the same during the iterations."""
+        gradient, mask = fields.gradient, fields.mask
+        shape, N = gradient.shape[-2:], gradient.shape[0]
+        noise = noise_level(gradient.detach(), mask)
+        lam = _per_surface("lam", self.lam, _AUTO_LAM * torch.ones_like(noise))
+        mu = _per_surface("mu", self.mu, _AUTO_MU * noise)
+        coverage = self.patches.coverage(shape, dtype=gradient.dtype, device=gradient.device)
+        if mask is None:
+            return _Model(fields, self.patches, coverage, None, noise, lam, mu)
+        valid = self.patches.extract(mask.to(gradient.dtype)) > 0
+        return _Model(fields, self.patches, coverage * mask, valid.expand(N, -1, -1), noise, lam, mu)
+
+    def _initial_dictionary(self, fields: Fields) -> Tensor:
+        D = self.dictionary.to(fields.gradient)
+        D = D if D.ndim == 3 else D[None]
+        N = fields.gradient.shape[0]
+        if D.shape[0] not in (1, N) or (self.learn == "shared" and D.shape[0] != 1):
+            raise ValueError(f"DLS: dictionary {tuple(D.shape)} does not fit {N} surfaces with learn={self.learn!r}")
+        D = D / D.norm(dim=1, keepdim=True)
+        return D.expand(N, -1, -1) if self.learn == "each" else D
+
+    def _sweeps(self, model: _Model, P: Tensor, D: Tensor, B: Tensor, fill: Tensor | None) -> tuple[Tensor, Tensor]:
+        for sweep in range(self.n_sweeps):
+            if model.valid is not None and fill is not None:
+                fill = D @ B if sweep else fill
+                P = torch.where(model.valid, P, torch.where(model.valid.any(1, keepdim=True), fill, 0))
+            D, B = soup_dil_sweep(
+                P, D, B, model.mu[:, None], self.bound, self.order, unused=self.unused, learn=self.learn != "fixed"
+            )
+        return D, B
+
+    def _step(self, model: _Model, z: Tensor, E: Tensor) -> Tensor:
+        """The height for given patches E = D B."""
+        fields = model.fields
+        v, w = self.data_term.edges(fields, z)
+        strength = 2 * model.lam[:, None, None, None]
+        weight = strength * model.coverage
+        pull = strength * model.patches.adjoint(E, z.shape) * (model.coverage > 0)
+        if fields.anchor is not None and fields.anchor_weight is not None:
+            weight, pull = weight + fields.anchor_weight, pull + fields.anchor_weight * fields.anchor
+        if self.z_step == "exact":
+            anchor = pull / torch.where(weight > 0, weight, 1)
+            return solve(v, w, anchor, weight, tol=self.z_tol, z0=z.detach(), pixel_size=fields.steps).height
+        a = GradientOperator("forward", fields.steps)
+        largest = z.new_ones(()) if w is None else w.detach().amax((-3, -2, -1), keepdim=True).clamp(min=1)
+        tau = 1 / (a.norm_bound**2 * largest)
+        for _ in range(self.n_prox):
+            misfit = a(z) - v
+            slope = a.adjoint(misfit if w is None else w * misfit)
+            z = (z - tau * slope + tau * pull) / (1 + tau * weight)
+        return z
+
+    def _objective(self, model: _Model, z: Tensor, P: Tensor, D: Tensor, B: Tensor) -> Tensor:
+        """(N,) value of the cost, for heights in pixels."""
+        fields = model.fields
+        cost = self.data_term.data_cost(fields, z)
+        if fields.anchor is not None and fields.anchor_weight is not None:
+            cost = cost + 0.5 * (fields.anchor_weight * (z - fields.anchor).square()).sum((-3, -2, -1))
+        return cost + model.lam * _patch_cost(P, D, B, model.mu, model.valid)
+
+    def extra_repr(self) -> str:
+        """The settings, as `print` shows them."""
+        names = ("lam", "mu", "n_iter", "z_step", "order", "learn", "tol", "pixel_size")
+        return f"{self.patches}, " + ", ".join(f"{n}={getattr(self, n)!r}" for n in names)
+
+
+class _Model(NamedTuple):
+    """The constants of one run: coverage (1 or N, 1, H, W) within the mask, valid pixels of the patches (N, n, L)."""
+
+    fields: Fields
+    patches: Patches
+    coverage: Tensor
+    valid: Tensor | None
+    noise: Tensor
+    lam: Tensor
+    mu: Tensor
+
+
+def dls_objective(
+    height: Tensor,
+    gradient: Tensor,
+    dictionary: Tensor,
+    codes: Tensor,
+    lam: float | Tensor,
+    mu: float | Tensor,
+    *,
+    patches: Patches | None = None,
+    mask: Tensor | None = None,
+    weight: Tensor | None = None,
+) -> Tensor:
+    r"""The cost that DLS minimises, per surface.
+
+        1/2 \sum_e w_e ((A z)_e - v_e)^2 + lam ( \sum_j ||M_j (P_j z - D b_j)||^2 + mu^2 ||B||_0 )
+
+    with M_j the valid pixels of patch j (all of them without a mask).
+
+    Args:
+        height: (N, 1, H, W), in pixels.
+        gradient: (N, 2, H, W).
+        dictionary: (N or 1, n, K).
+        codes: (N, K, L).
+        lam: a number or (N,).
+        mu: a number or (N,).
+        patches: the patches; `Patches(8, 2)` by default.
+        mask: (N, 1, H, W) bool.
+        weight: (N, 1 or 2, H, W).
+
+    Returns:
+        (N,).
+    """
+    patches = Patches() if patches is None else patches
+    data = LeastSquares()
+    fields = data.check(gradient, mask, weight)
+    valid = None if fields.mask is None else patches.extract(fields.mask.to(height.dtype)) > 0
+    mu = torch.as_tensor(mu, dtype=height.dtype, device=height.device).expand(height.shape[0])
+    return data.data_cost(fields, height) + lam * _patch_cost(patches.extract(height), dictionary, codes, mu, valid)
+
+
+def _patch_cost(P: Tensor, D: Tensor, B: Tensor, mu: Tensor, valid: Tensor | None) -> Tensor:
+    misfit = (P - D @ B).square()
+    fit = (misfit if valid is None else torch.where(valid, misfit, 0)).sum((1, 2))
+    return fit + mu.square() * (B != 0).sum((1, 2))
+
+
+def _extend(z: Tensor, fields: Fields) -> Tensor:
+    assert fields.mask is not None
+    return harmonic_extension(z, fields.mask, pixel_size=fields.steps)
+
+
+def _choose(active: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """The new value where a surface is still active."""
+    return torch.where(active.view(-1, *[1] * (new.ndim - 1)), new, old)
+
+
+def _parameter(name: str, value: float | Tensor | str) -> float | Tensor | str:
+    """Lam or mu: "auto", a number or a tensor, neither negative nor NaN."""
+    known = value == "auto" if isinstance(value, str) else bool((torch.as_tensor(value) >= 0).all())
+    if not known:
+        raise ValueError(f"DLS: {name}={value!r} given, 'auto' or a number of at least 0 is needed")
+    return value
+
+
+def _per_surface(name: str, value: float | Tensor | str, auto: Tensor) -> Tensor:
+    if isinstance(value, str):
+        return auto
+    value = torch.as_tensor(value, dtype=auto.dtype, device=auto.device)
+    if value.numel() not in (1, auto.numel()):
+        raise ValueError(f"DLS: {name} {tuple(value.shape)} does not fit {auto.numel()} surfaces")
+    return value.reshape(-1).expand(auto.shape)
+
+
+def _check_dictionary(dictionary: Tensor, patches: Patches) -> None:
+    if not isinstance(dictionary, Tensor):
+        raise TypeError(f"DLS: dictionary is a {type(dictionary).__name__}, a tensor is needed")
+    if dictionary.ndim not in (2, 3) or dictionary.shape[-2] != patches.n_pixels or 0 in dictionary.shape:
+        wanted = f"(n, K) or (N, n, K) with n = {patches.n_pixels}"
+        raise ValueError(f"DLS: dictionary {tuple(dictionary.shape)} given, {wanted} is needed")
+    norms = dictionary.detach().norm(dim=-2)
+    if not bool((norms.isfinite() & (norms > 0)).all()):
+        raise ValueError("DLS: dictionary has an atom that is zero or not finite")

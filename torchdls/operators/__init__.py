@@ -1,0 +1,15 @@
+"""Linear maps with their exact adjoints: gradients, patches, cosine transforms."""
+
+from torchdls.operators.cosine import dct2, idct2, neumann_eigenvalues
+from torchdls.operators.gradient import GradientOperator, as_pixel_size, edge_slopes
+from torchdls.operators.patches import Patches
+
+__all__ = [
+    "GradientOperator",
+    "Patches",
+    "as_pixel_size",
+    "dct2",
+    "edge_slopes",
+    "idct2",
+    "neumann_eigenvalues",
+]

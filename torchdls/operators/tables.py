@@ -1,0 +1,34 @@
+"""A bounded cache for the constant tables (cosines, eigenvalues) that the operators look up at every call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache, wraps
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def table(build: Callable[..., Tensor], maxsize: int = 64) -> Callable[..., Tensor]:
+    """Cache a table that `build(*args)` computes on the CPU in float64, in the dtype and on the device of `like`.
+
+    Tables are constants: they are built outside autograd and outside inference mode, so one table serves every caller.
+    While a graph is being traced nothing is cached, since a traced tensor must not outlive its graph.
+    """
+
+    def make(args: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+        with torch.inference_mode(False), torch.no_grad():
+            values = build(*args)
+            if values.is_complex():
+                dtype = dtype.to_complex()
+            return values.to(dtype).to(device)
+
+    cached = lru_cache(maxsize)(make)
+
+    @wraps(build)
+    def lookup(*args: Any, like: Tensor) -> Tensor:
+        find = make if torch.compiler.is_compiling() else cached
+        return find(args, like.dtype, like.device)
+
+    return lookup

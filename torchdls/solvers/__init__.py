@@ -1,0 +1,16 @@
+"""The linear solve (*) that every integrator is built around."""
+
+from torchdls.solvers.cg import conjugate_gradients
+from torchdls.solvers.components import connected_components
+from torchdls.solvers.extension import harmonic_extension
+from torchdls.solvers.poisson import ConvergenceWarning, SolveResult, solve, solve_direct
+
+__all__ = [
+    "ConvergenceWarning",
+    "SolveResult",
+    "conjugate_gradients",
+    "connected_components",
+    "harmonic_extension",
+    "solve",
+    "solve_direct",
+]

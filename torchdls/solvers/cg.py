@@ -1,0 +1,73 @@
+"""Preconditioned conjugate gradients for a batch of symmetric systems, each with its own steps and its own stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+LinearMap = Callable[[Tensor], Tensor]
+
+
+class CGResult(NamedTuple):
+    """Solution (N, ...), and per system the iterations, the relative residual, and whether it met `tol`."""
+
+    x: Tensor
+    iterations: Tensor
+    residual: Tensor
+    converged: Tensor
+
+
+def conjugate_gradients(
+    apply: LinearMap, precondition: LinearMap, b: Tensor, x0: Tensor | None, *, tol: float, max_iter: int
+) -> CGResult:
+    """Solve H x = b for every system of the batch.
+
+    Args:
+        apply: x -> H x, symmetric positive semidefinite on each system; b must lie in its range.
+        precondition: an approximate inverse, symmetric positive definite on that range.
+        b: (N, ...) right-hand sides.
+        x0: (N, ...) warm start, or None for 0.
+        tol: a system stops once ||r|| <= tol ||b||, with r the residual of the recursion (free of rounding in x).
+        max_iter: limit of iterations.
+
+    A system that has stopped is frozen: its result does not depend on its neighbours in the batch.
+    """
+    x = torch.zeros_like(b) if x0 is None else x0.clone()
+    r = b.clone() if x0 is None else b - apply(x0)
+    goal = tol * _norm(b)
+    active = _norm(r) > goal
+    iterations = torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
+    p, rho = torch.zeros_like(b), torch.ones_like(goal)
+    for _ in range(max_iter):
+        if not bool(active.any()):
+            break
+        y = precondition(r)
+        rho_new = _dot(r, y)
+        p = y + _ratio(rho_new, rho, iterations > 0) * p
+        q = apply(p)
+        step = _ratio(rho_new, _dot(p, q), active)
+        x += step * p
+        r -= step * q
+        rho = rho_new
+        iterations += active
+        active = active & (_norm(r) > goal)
+    norm = _norm(b)
+    residual = _norm(r) / torch.where(norm > 0, norm, 1)
+    return CGResult(x, iterations, residual, ~active)
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return (a * b).flatten(1).sum(1)
+
+
+def _norm(a: Tensor) -> Tensor:
+    return a.flatten(1).norm(dim=1)
+
+
+def _ratio(a: Tensor, b: Tensor, where: Tensor) -> Tensor:
+    """a / b where `where` holds and b is not 0, else 0; shaped (N, 1, 1, 1) to scale a field."""
+    good = where & (b != 0)
+    return torch.where(good, a / torch.where(good, b, 1), 0)[:, None, None, None]

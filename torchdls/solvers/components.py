@@ -1,0 +1,73 @@
+"""Connected components of the pixel grid, and the free constant that each component without an anchor has."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Gauge(NamedTuple):
+    """The null space of (*): one constant on every connected component that no anchor holds.
+
+    Attributes:
+        labels: (N, H * W) int64, the same number on all pixels of a component.
+        share: (N, H * W), 1 / size of the pixel's component, or 0 where an anchor fixes its height.
+    """
+
+    labels: Tensor
+    share: Tensor
+
+    def remove(self, x: Tensor) -> Tensor:
+        """Orthogonal projection of x (N, 1, H, W) on zero mean over each free component."""
+        flat = x.flatten(1)
+        sums = torch.zeros_like(flat).scatter_add(1, self.labels, flat)
+        return (flat - sums.gather(1, self.labels) * self.share).view_as(x)
+
+
+def connected_components(linked: Tensor) -> Tensor:
+    """Label the components of the grid whose neighbours are joined by the edges of `linked`.
+
+    Args:
+        linked: (N, 2, H, W) bool; [:, 0, i, j] joins (i, j) to (i, j + 1), [:, 1, i, j] joins it to (i + 1, j).
+
+    Returns:
+        (N, H, W) int64: the smallest flat index in the component of each pixel.
+
+    The labels start as the runs of each row; then every link between rows hooks the larger root under the smaller one
+    and paths are halved, until nothing changes: a logarithmic number of sweeps in practice, on any device.
+    """
+    n, _, h, w = linked.shape
+    index = torch.arange(h * w, device=linked.device).view(h, w).expand(n, h, w)
+    starts = torch.ones_like(linked[:, 0])
+    starts[..., 1:] = ~linked[:, 0, :, :-1]
+    label = torch.where(starts, index, 0).cummax(-1).values.flatten(1)
+    down = linked[:, 1, :-1].flatten(1)
+    while True:
+        above, below = label.view(n, h, w)[:, :-1].flatten(1), label.view(n, h, w)[:, 1:].flatten(1)
+        low = torch.minimum(above, below)
+        hooked = label.scatter_reduce(1, above, torch.where(down, low, above), "amin")
+        hooked = hooked.scatter_reduce(1, below, torch.where(down, low, below), "amin")
+        hooked = _roots(hooked)
+        if torch.equal(hooked, label):
+            return label.view(n, h, w)
+        label = hooked
+
+
+def _roots(parent: Tensor) -> Tensor:
+    while not torch.equal(shorter := parent.gather(1, parent), parent):
+        parent = shorter
+    return parent
+
+
+def free_constants(w: Tensor, r: Tensor | None) -> Gauge:
+    """The gauge of (*) with edge weights w (N, 2, H, W) and anchor weights r (N, 1, H, W) or None."""
+    labels = connected_components(w > 0).flatten(1)
+    ones = torch.ones_like(labels, dtype=w.dtype)
+    size = torch.zeros_like(ones).scatter_add(1, labels, ones)
+    share = 1 / size.gather(1, labels)
+    if r is not None:
+        held = torch.zeros_like(ones).scatter_add(1, labels, (r > 0).to(w.dtype).flatten(1))
+        share = torch.where(held.gather(1, labels) > 0, 0, share)
+    return Gauge(labels, share)
