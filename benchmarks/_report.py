@@ -29,6 +29,11 @@ def environment(packages: Iterable[str] = ("torch", "numpy", "scipy", "kornia", 
     }
 
 
+def results_folder(smoke: bool) -> Path:
+    """Where a script writes by default: the committed results, or a scratch folder for a smoke run."""
+    return ROOT.parent / "build" / "benchmarks" if smoke else ROOT / "results"
+
+
 def write_json(path: Path | str, **content: Any) -> Path:
     """Write the content with its environment."""
     path = Path(path)

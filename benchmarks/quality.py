@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _report import ROOT, markdown_table, write_json
+from _report import markdown_table, results_folder, write_json
 from torch import Tensor
 
 from torchdls import DLS, SURFACES, LeastSquares, add_noise
@@ -149,18 +149,19 @@ def main() -> None:
     parser.add_argument("--trials", action="store_true", help="single changes to the algorithm on Tent at 1, 10, 20 dB")
     parser.add_argument("--seeds", type=int, default=3, help="noise draws per row")
     parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=ROOT / "results")
+    parser.add_argument("--out", type=Path, help="folder for the results")
     args = parser.parse_args()
+    out = args.out or results_folder(args.smoke)
     seeds = range(args.first_seed, args.first_seed + (1 if args.smoke else args.seeds))
     n, n_iter = (48, 3) if args.smoke else (200, 100)
     sweep: Sequence[float] = (1.5,) if args.smoke else SWEEP
     if args.trials:
         trials = run_trials(Case("tent", (1, 10, 20), seeds, n), n_iter, sweep[1:6] or sweep)
-        path = write_json(args.out / "trials.json", trials=trials)
+        path = write_json(out / "trials.json", trials=trials)
     else:
         rows = [row for name in PAPER for row in run_table(Case(name, SNRS, seeds, n), n_iter, sweep)]
-        path = write_json(args.out / "quality.json", rows=rows)
-        (args.out / "quality.md").write_text(table(rows))
+        path = write_json(out / "quality.json", rows=rows)
+        (out / "quality.md").write_text(table(rows))
         print(table(rows))
     print(f"written: {path}")
 
