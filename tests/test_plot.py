@@ -121,8 +121,10 @@ def test_page_has_a_button_for_each_surface_and_one_visible():
     assert [button.label for button in buttons] == ["Least squares", "DLS"]
     assert buttons[1].args[0]["visible"] == [False, True]
     assert "RMSE 1" in buttons[1].args[1]["annotations[0].text"]
-    html = page.to_html()
+    html = plot.page_html(page)
     assert len(html) < 8e6
+    assert "<title>Test</title>" in html
+    assert html == plot.page_html(page)
     assert not re.search(r"<script[^>]+src=", html)  # works offline
 
 

@@ -1,7 +1,7 @@
 """Pictures: hillshades of several surfaces under one light, and a page to turn them around in 3-D.
 
 Both return figure objects, made without pyplot, so nothing global changes and no display is needed:
-`compare_heights(...).savefig("surfaces.png")`, `surface_page(...).write_html("surfaces.html")`.
+`compare_heights(...).savefig("surfaces.png")`, `Path("surfaces.html").write_text(page_html(surface_page(...)))`.
 Needs `pip install 'torchdls[plots]'`.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 _Plane = NDArray[np.float64]
 _INK, _FAINT = "#222222", "#8a8a8a"
+_EARTH = ["#6f9a9c", "#93b48a", "#cfcb97", "#e2cfae", "#f0e4dc"]  # muted: the light tells the relief
 _COLORS = ("#d1495b", "#00798c", "#edae49", "#66507a", "#3d7a3d")
 
 
@@ -157,7 +159,7 @@ def surface_page(
 ) -> go.Figure:
     """One surface at a time in 3-D, to turn and zoom, with a button for each; the view stays when the surface changes.
 
-    `.write_html(path)` gives a page of about 5 MB that works offline. Every k-th pixel is shown, with k such that no
+    `page_html` makes it a page of about 5 MB that works offline. Every k-th pixel is shown, with k such that no
     side has more than `max_side`: means over blocks would hide the noise. Proportions are true, except that surfaces
     flatter than an eighth of their width are raised to that; the label of the axis says by how much.
 
@@ -207,19 +209,26 @@ def surface_page(
     return figure
 
 
+def page_html(page: go.Figure) -> str:
+    """The page as one HTML document that fills the window and works offline; the same text for the same figure."""
+    html: str = page.to_html(div_id="surface", default_height="100vh", config={"displaylogo": False})
+    title = escape(page.layout.title.text or "Surfaces")
+    return html.replace("<head>", f"<head><title>{title}</title><style>body {{ margin: 0 }}</style>", 1)
+
+
 def _plotly_surface(go: Any, x: Any, y: Any, z: Any, span: tuple[float, float], *, visible: bool, unit: str) -> Any:
-    lighting = {"ambient": 0.45, "diffuse": 0.9, "specular": 0.08, "roughness": 0.9, "fresnel": 0.05}
+    lighting = {"ambient": 0.35, "diffuse": 0.85, "specular": 0.05, "roughness": 0.9, "fresnel": 0.02}
     return go.Surface(
         x=x,
         y=y,
         z=z,
         cmin=span[0],
         cmax=span[1],
-        colorscale="Cividis",
+        colorscale=_EARTH,
         visible=visible,
         lighting=lighting,
         lightposition={"x": -1e5, "y": 1e5, "z": 1e5},
-        colorbar={"title": {"text": f"height ({unit})"}, "thickness": 14, "len": 0.6},
+        colorbar={"title": {"text": f"height ({unit})"}, "thickness": 12, "len": 0.5, "outlinewidth": 0},
         hovertemplate="x %{x:.4g}<br>y %{y:.4g}<br>height %{z:.4g}<extra></extra>",
     )
 
@@ -242,20 +251,20 @@ def _lay_out(
         "aspectratio": aspect,
         "xaxis": {"title": {"text": f"x ({unit})"}},
         "yaxis": {"title": {"text": f"y, up ({unit})"}},
-        "zaxis": {"title": {"text": label}, "range": list(z_range)},
-        "camera": {"eye": {"x": -0.75, "y": -1.25, "z": 0.95}},
+        "zaxis": {"title": {"text": label}, "range": list(z_range), "nticks": 4},
+        "camera": {"eye": {"x": -0.6, "y": -1.15, "z": 0.85}, "center": {"x": 0, "y": 0, "z": -0.12}},
         "uirevision": "the view stays",
     }
+    above = {"showarrow": False, "x": 0.5, "y": 1.0, "xref": "paper", "yref": "paper", "yanchor": "bottom"}
+    menu = {"xanchor": "center", "yanchor": "bottom", "pad": {"b": 44}}
     figure.update_layout(
         template="plotly_white",
-        title={"text": title, "x": 0.5},
+        title={"text": title, "x": 0.5, "y": 0.975, "yanchor": "top"},
         scene=scene,
-        margin={"l": 0, "r": 0, "t": 90, "b": 0},
+        margin={"l": 0, "r": 0, "t": 130, "b": 0},
         font={"family": "system-ui, sans-serif", "color": _INK},
-        annotations=[{"text": line, "showarrow": False, "x": 0.5, "y": 1.0, "xref": "paper", "yref": "paper"}],
-        updatemenus=[
-            {"type": "buttons", "direction": "right", "buttons": buttons, "x": 0.5, "y": 0.02, "xanchor": "center"}
-        ],
+        annotations=[{**above, "text": line, "yshift": 12, "font": {"size": 15}}],
+        updatemenus=[{"type": "buttons", "direction": "right", "buttons": buttons, "x": 0.5, "y": 1.0, **menu}],
     )
 
 
