@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import hypot
+from math import hypot, inf
+from numbers import Real
 
 import torch
 import torch.nn.functional as F
@@ -91,10 +92,14 @@ class GradientOperator:
 
 def as_pixel_size(pixel_size: float | Sequence[float]) -> tuple[float, float]:
     """One number or a pair (dx, dy) as a pair of floats; ValueError unless both are positive and finite."""
-    pair = (pixel_size, pixel_size) if isinstance(pixel_size, int | float) else tuple(pixel_size)
-    if len(pair) != 2 or not all(isinstance(d, int | float) and 0 < d < float("inf") for d in pair):
+    pair = tuple(pixel_size) if isinstance(pixel_size, Iterable) else (pixel_size, pixel_size)
+    if len(pair) != 2 or not all(_is_length(d) for d in pair):
         raise ValueError(f"pixel_size: {pixel_size!r} given, a positive number or a pair (dx, dy) of them is needed")
     return float(pair[0]), float(pair[1])
+
+
+def _is_length(d: object) -> bool:
+    return isinstance(d, Real) and not isinstance(d, bool) and 0 < float(d) < inf
 
 
 def _kernel(values: Sequence[Sequence[float]] | Tensor) -> Kernel:
