@@ -27,6 +27,12 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.integrators import Integrator as Integrator
     from torchdls.integrators import LeastSquares as LeastSquares
     from torchdls.integrators import dls_objective as dls_objective
+    from torchdls.io import load_camera as load_camera
+    from torchdls.io import load_field as load_field
+    from torchdls.io import load_height as load_height
+    from torchdls.io import load_mask as load_mask
+    from torchdls.io import save_height as save_height
+    from torchdls.io import save_mesh as save_mesh
     from torchdls.metrics import made as made
     from torchdls.metrics import mean_angular_error as mean_angular_error
     from torchdls.metrics import rmse as rmse
@@ -37,6 +43,10 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.operators import dct2 as dct2
     from torchdls.operators import edge_slopes as edge_slopes
     from torchdls.operators import idct2 as idct2
+    from torchdls.plot import compare_heights as compare_heights
+    from torchdls.plot import hillshade as hillshade
+    from torchdls.plot import page_html as page_html
+    from torchdls.plot import surface_page as surface_page
     from torchdls.solvers import ConvergenceWarning as ConvergenceWarning
     from torchdls.solvers import SolveResult as SolveResult
     from torchdls.solvers import solve as solve
@@ -79,6 +89,17 @@ _MODULE_OF = {
     "height_to_points": "geometry",
     "log_depth_to_depth": "geometry",
     "normals_to_gradient": "geometry",
+    # files and pictures
+    "load_camera": "io",
+    "load_field": "io",
+    "load_height": "io",
+    "load_mask": "io",
+    "save_height": "io",
+    "save_mesh": "io",
+    "compare_heights": "plot",
+    "hillshade": "plot",
+    "page_html": "plot",
+    "surface_page": "plot",
     # data and measures
     "SURFACES": "surfaces",
     "Surface": "surfaces",
