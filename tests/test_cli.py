@@ -81,8 +81,12 @@ def test_methods_lists_the_registry(capsys):
 
     assert main(["methods"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == list(INTEGRATORS)
-    assert all(len(line.split()) > 3 for line in lines)
+    methods = [line for line in lines if not line.startswith(" ")]
+    assert [line.split()[0] for line in methods] == list(INTEGRATORS)
+    assert all(len(line.split()) > 3 for line in methods)
+    found = " ".join(lines)
+    assert found.count("pixel_size=1.0") == len(INTEGRATORS)
+    assert "tol=1e-06, max_iter=500" in found
 
 
 # --- integrate -----------------------------------------------------------------------------------------------------
@@ -216,7 +220,7 @@ def test_existing_output_needs_force(tmp_path, capsys, gradient_file):
 @pytest.mark.parametrize(
     "extra, match",
     [
-        (["--method", "magic"], "'magic' is unknown; choose from least_squares, dls"),
+        (["--method", "magic"], "'magic' is unknown; choose from least_squares, "),
         (["--convention", "opengl"], "'opengl' is not for gradient; choose from image"),
         (["--pixel-size", "0"], "pixel_size: 0.0"),
         (["--pixel-size", "1", "2", "3"], "3 numbers given"),

@@ -10,6 +10,7 @@ import argparse
 import ast
 import os
 import sys
+import textwrap
 import time
 import warnings
 from collections.abc import Iterator, Sequence
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchdls import __version__
+from torchdls._registry import INTEGRATORS
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -78,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     _add_integrate(commands)
     _add_demo(commands)
-    methods = commands.add_parser("methods", help="list the methods", description="List the methods, one line each.")
+    methods = commands.add_parser("methods", help="list the methods", description="List the methods and their options.")
     methods.set_defaults(run=_methods)
     return parser
 
@@ -94,7 +96,7 @@ def _add_integrate(commands: Any) -> None:
         "`normals` and optionally `mask`, `weight`, `pixel_size`")  # fmt: skip
     add("-o", "--out", action="append", required=True, metavar="OUT",
         help="NPZ, NPY, TIFF (32-bit), PNG (16-bit), PLY, OBJ, STL or GLB; may be repeated")  # fmt: skip
-    add("--method", default=_METHOD, help=f"see `torchdls methods` (default: {_METHOD})")
+    add("--method", default=_METHOD, help=f"{', '.join(INTEGRATORS)} (default: {_METHOD})")
     add("--set", action="append", default=[], metavar="NAME=VALUE", help="option of the method, such as lam=0.5")
     add("--mask", metavar="FILE", help="image or array; white or nonzero is valid")
     add("--convention", help="normals: opengl (default), directx, opencv, kornia, matlab; "
@@ -126,15 +128,14 @@ def _add_demo(commands: Any) -> None:
 
 
 def _methods(arguments: argparse.Namespace) -> None:
-    from torchdls.integrators import INTEGRATORS
-
-    for name, method in INTEGRATORS.items():
-        print(f"{name:<{max(map(len, INTEGRATORS))}}  {(method.__doc__ or '').strip().splitlines()[0]}")
+    indent = " " * (max(map(len, INTEGRATORS)) + 2)
+    for name in INTEGRATORS:
+        print(f"{name:<{len(indent)}}{INTEGRATORS.summary(name)}")
+        options = ", ".join(f"{option}={default!r}" for option, default in INTEGRATORS.parameters(name).items())
+        print(textwrap.fill(options, 110, initial_indent=indent, subsequent_indent=indent))
 
 
 def _method(name: str, pixel_size: tuple[float, float], settings: Sequence[str] = ()) -> Integrator:
-    from torchdls.integrators import INTEGRATORS
-
     if name not in INTEGRATORS:
         raise ValueError(f"--method: {name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
     options: dict[str, Any] = {"pixel_size": pixel_size}

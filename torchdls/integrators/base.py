@@ -41,9 +41,15 @@ class Integrator(nn.Module):
     its data term looks as a quadratic around a height (`edges`) and what it costs (`data_cost`), and so serves as
     `data_term` of DLS.
 
+    A method that cannot honour a mask, weights or anchors leaves them out of `accepts`; a call that brings one then
+    raises a ValueError, rather than a surface that ignores it.
+
     Args:
         pixel_size: spacing of the columns and the rows (dx, dy), or one number for both; heights come out in its unit.
     """
+
+    # Which of the optional arguments of `forward` the method honours.
+    accepts: frozenset[str] = frozenset({"mask", "weight", "anchor"})
 
     # Whether the method is built on the solve (*), so that `edges` and `data_cost` describe it and it can serve as a
     # data term.
@@ -78,8 +84,8 @@ class Integrator(nn.Module):
             TypeError: an argument is not a tensor, or the mask is not bool.
             ValueError: a shape, dtype or device does not fit, a value inside the mask is not finite, a weight is
             negative,
-                a mask is all False, or an anchor comes without its weight. The message names the argument and the
-                shapes.
+                a mask is all False, an anchor comes without its weight, or the method does not take one of them (see
+                `accepts`). The message names the argument and the shapes.
         """
         fields = self.check(gradient, mask, weight, anchor, anchor_weight)
         height = self.integrate(fields) * self.unit
@@ -114,6 +120,8 @@ class Integrator(nn.Module):
     ) -> Fields:
         """Validate the arguments of `forward` and bring them to the form of `Fields`; never writes to them."""
         name = type(self).__name__
+        for label, field in (("mask", mask), ("weight", weight), ("anchor", anchor), ("anchor", anchor_weight)):
+            _require(field is None or label in self.accepts, f"{name}: takes no {label}; LeastSquares and DLS do")
         _check_gradient(name, gradient)
         mask = _fit(name, "mask", mask, gradient, channels=(1,), dtype=torch.bool)
         weight = _fit(name, "weight", weight, gradient, channels=(1, 2))

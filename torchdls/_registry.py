@@ -1,0 +1,55 @@
+"""The integrators by name, without loading any of them: a name costs nothing until its class is asked for."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import Any
+
+
+class Registry(Mapping[str, Any]):
+    """A read-only table from names to classes of `torchdls`, each imported when it is looked up.
+
+    Iterating, `len` and `in` import nothing, so that the command line can list the names before PyTorch is loaded.
+
+    Args:
+        classes: name -> name of a class that `torchdls` exports.
+    """
+
+    def __init__(self, classes: Mapping[str, str]) -> None:
+        self._classes = dict(classes)
+
+    def __getitem__(self, name: str) -> Any:
+        """The class of that name; KeyError, with the known names, if there is none."""
+        if name not in self._classes:
+            raise KeyError(f"{name!r} is unknown; choose from {', '.join(self)}")
+        return getattr(import_module("torchdls"), self._classes[name])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._classes
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._classes)
+
+    def __len__(self) -> int:
+        return len(self._classes)
+
+    def __repr__(self) -> str:
+        return f"Registry({', '.join(self)})"
+
+    def summary(self, name: str) -> str:
+        """What the method is, in one line: the first of its docstring."""
+        return (inspect.getdoc(self[name]) or "").partition("\n")[0]
+
+    def parameters(self, name: str) -> dict[str, Any]:
+        """The options of the method and their defaults."""
+        return {p.name: p.default for p in inspect.signature(self[name]).parameters.values()}
+
+
+INTEGRATORS = Registry(
+    {
+        "least_squares": "LeastSquares",
+        "dls": "DLS",
+    }
+)
