@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.fft import dstn
 
-from torchdls.noise import _CUT, _TRIMMED_VARIANCE, _sine_transform, noise_level
+from torchdls.noise import _CUT, _TRIMMED_VARIANCE, noise_level
 from torchdls.operators import GradientOperator, dct2, edge_slopes, idct2, neumann_eigenvalues
 from torchdls.surfaces import SURFACES, add_noise, noise_sigma, terrain
 
@@ -50,13 +50,6 @@ def test_the_sine_modes_are_the_residual_of_least_squares():
     curl = v[0, 0, :-1, :-1] - v[0, 0, 1:, :-1] + v[0, 1, :-1, 1:] - v[0, 1, :-1, :-1]
     modes = torch.from_numpy(dstn(curl.numpy(), type=1, norm="ortho"))
     torch.testing.assert_close((modes.square() / eigenvalues[1:, 1:]).sum(), residual.square().sum())
-
-
-@pytest.mark.parametrize("n", [2, 3, 20, 64, 65, 100])
-def test_sine_transform_equals_scipy(n):
-    x = torch.randn(3, n - 1, generator=torch.Generator().manual_seed(n), dtype=torch.float64)
-    expected = torch.from_numpy(dstn(x.numpy(), type=1, norm="ortho", axes=(1,)))
-    torch.testing.assert_close(_sine_transform(x), expected)
 
 
 def test_trimmed_variance_is_that_of_a_cut_normal():

@@ -6,16 +6,15 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from torchdls.operators import as_pixel_size, edge_slopes
+from torchdls.operators import as_pixel_size, dst2, edge_slopes
+from torchdls.operators.sine import squared_sines
 from torchdls.operators.tables import table
 
 _CUT = 3.0  # samples beyond so many standard deviations belong to the surface (creases, waves), not to the noise
 _NORMAL_MEDIAN = 0.6744897501960817  # median magnitude of a standard normal variable
 _KEPT = math.erf(_CUT / math.sqrt(2))
 _TRIMMED_VARIANCE = 1 - _CUT * math.sqrt(2 / math.pi) * math.exp(-_CUT * _CUT / 2) / _KEPT  # of a cut standard normal
-_MATRIX_LIMIT = 64  # up to this side a product with the sine matrix beats the FFT
 
 
 def noise_level(
@@ -123,7 +122,7 @@ def _stationary(mask: Tensor | None, weight: Tensor | None) -> Tensor:
 def _spectral_scale(curl: Tensor, dx: float, dy: float) -> Tensor:
     """(N,) robust scale of the sine coefficients of the curl, each over its standard deviation for sigma = 1."""
     h, w = curl.shape[-2] + 1, curl.shape[-1] + 1
-    coefficients = _sine_transform(_sine_transform(curl).mT).mT
+    coefficients = dst2(curl)
     return _robust_scale(coefficients * _gain(h, w, dx, dy, like=curl), _high_modes(h, w, like=curl) > 0)
 
 
@@ -141,35 +140,15 @@ def _robust_scale(x: Tensor, valid: Tensor | None = None) -> Tensor:
     return norm / (_TRIMMED_VARIANCE * kept.sum((-2, -1))).sqrt()
 
 
-def _sine_transform(x: Tensor) -> Tensor:
-    """Orthonormal DST-I of the last dimension: sqrt(2/n) sum_i x_i sin(pi k i/n) for i, k = 1 .. n - 1."""
-    n = x.shape[-1] + 1
-    if n <= _MATRIX_LIMIT:
-        return x @ _sine_matrix(n, like=x)
-    odd = torch.cat([functional.pad(x, (1, 1)), -x.flip(-1)], -1)
-    return torch.fft.rfft(odd).imag[..., 1:n] * -math.sqrt(1 / (2 * n))
-
-
-def _squared_sines(n: int) -> Tensor:
-    return torch.sin(torch.arange(1, n, dtype=torch.float64, device="cpu") * (math.pi / (2 * n))).square()
-
-
 @table
 def _gain(h: int, w: int, dx: float, dy: float) -> Tensor:
-    y, x = _squared_sines(h)[:, None], _squared_sines(w)
+    y, x = squared_sines(h)[:, None], squared_sines(w)
     return (4 * (dx * dx * y * (1 - x) + dy * dy * x * (1 - y))).rsqrt()
 
 
 @table
 def _high_modes(h: int, w: int) -> Tensor:
-    return (_squared_sines(h)[:, None] + _squared_sines(w) > 0.5).double()
-
-
-@table
-def _sine_matrix(n: int) -> Tensor:
-    k = torch.arange(1, n, device="cpu")
-    angle = (k[:, None] * k) % (2 * n)
-    return math.sqrt(2 / n) * torch.sin(angle.double() * (math.pi / n))
+    return (squared_sines(h)[:, None] + squared_sines(w) > 0.5).double()
 
 
 def _check(gradient: Tensor, mask: Tensor | None, weight: Tensor | None) -> None:
