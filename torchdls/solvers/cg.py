@@ -35,9 +35,13 @@ def conjugate_gradients(
 
     A system that has stopped is frozen: its result does not depend on its neighbours in the batch.
     """
-    x = torch.zeros_like(b) if x0 is None else x0.clone()
-    r = b.clone() if x0 is None else b - apply(x0)
-    goal = tol * _norm(b)
+    norm = _norm(b)
+    goal = tol * norm
+    if x0 is None:
+        x, r = torch.zeros_like(b), b.clone()
+    else:  # where b = 0 the solution is 0, which no iteration from elsewhere would meet
+        x = torch.where(norm.view(-1, *[1] * (b.ndim - 1)) > 0, x0, 0)
+        r = b - apply(x)
     active = _norm(r) > goal
     iterations = torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
     p, rho = torch.zeros_like(b), torch.ones_like(goal)
@@ -54,7 +58,6 @@ def conjugate_gradients(
         rho = rho_new
         iterations += active
         active = active & (_norm(r) > goal)
-    norm = _norm(b)
     residual = _norm(r) / torch.where(norm > 0, norm, 1)
     return CGResult(x, iterations, residual, ~active)
 

@@ -84,10 +84,14 @@ def solve(
     Returns:
         SolveResult(height, iterations, residual, converged).
 
+    Raises:
+        ValueError: a shape does not fit, or `tol`, `max_iter` or `pixel_size` is not positive.
+
     Source: Simchony, Chellappa, Shao (1990) for the direct solve; Durou, Courteille (2007) for the mask.
     """
     setting = _Setting(as_pixel_size(pixel_size), tol, max_iter)
     r = _as_weight(anchor_weight, v)
+    _check(v, setting, w=w, anchor=anchor, anchor_weight=r, z0=z0)
     weighted = v if w is None else w * v
     b = _A(setting).adjoint(weighted)
     if r is not None and anchor is not None:
@@ -120,9 +124,24 @@ def _A(setting: _Setting) -> GradientOperator:
 
 
 def _as_weight(r: Tensor | float | None, like: Tensor) -> Tensor | None:
-    if r is None or isinstance(r, Tensor):
+    if r is None or (isinstance(r, Tensor) and r.ndim):
         return r
-    return torch.full((like.shape[0], 1, 1, 1), float(r), dtype=like.dtype, device=like.device)
+    return torch.as_tensor(r, dtype=like.dtype, device=like.device).expand(like.shape[0], 1, 1, 1)
+
+
+def _check(v: Tensor, setting: _Setting, **fields: Tensor | None) -> None:
+    if v.ndim != 4 or v.shape[1] != 2:
+        raise ValueError(f"solve: v {tuple(v.shape)} given, (N, 2, H, W) is needed")
+    if not setting.tol > 0 or not setting.max_iter > 0:
+        raise ValueError(f"solve: tol={setting.tol!r} and max_iter={setting.max_iter!r} given, both must be positive")
+    for name, field in fields.items():
+        if field is None:
+            continue
+        channels = (1, 2) if name == "w" else (1,)
+        sizes = (v.shape[2:], (1, 1)) if name == "anchor_weight" else (v.shape[2:],)
+        fits = field.ndim == 4 and field.shape[0] in (1, v.shape[0])
+        if not fits or field.shape[1] not in channels or field.shape[2:] not in sizes:
+            raise ValueError(f"solve: {name} {tuple(field.shape)} does not fit v {tuple(v.shape)}")
 
 
 def _present_edges(v: Tensor) -> Tensor:
@@ -212,7 +231,7 @@ def _warn(residual: Tensor, converged: Tensor, setting: _Setting) -> None:
         f"solve: {int((~converged).sum())} of {len(converged)} surfaces stopped after {setting.max_iter} iterations "
         f"at a relative residual of up to {float(residual.max()):.1e}, above tol={setting.tol:.1e}",
         ConvergenceWarning,
-        stacklevel=4,
+        stacklevel=5,  # the caller of `solve`
     )
 
 
