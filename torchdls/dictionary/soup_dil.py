@@ -8,6 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchdls.dictionary.thresholds import THRESHOLDS, Threshold, shrink
+
 Order = Literal["atom", "block"]
 Unused = Literal["first", "keep"]
 
@@ -25,6 +27,7 @@ def soup_dil_sweep(
     *,
     unused: Unused = "first",
     learn: bool = True,
+    threshold: Threshold = "hard",
 ) -> tuple[Tensor, Tensor]:
     r"""One pass of block coordinate descent over all rows of B and all atoms of D.
 
@@ -49,6 +52,8 @@ def soup_dil_sweep(
         unused: an atom whose row of codes is zero becomes the first unit vector e_1 ("first", as in the paper's
             reference), or stays as it is ("keep"). Both leave the objective unchanged.
         learn: False keeps D fixed and updates the codes alone.
+        threshold: "hard" as above; "soft" or "firm" replace mu^2 ||B||_0 by the penalties of
+            `torchdls.dictionary.thresholds`, which have a derivative in mu.
 
     Returns:
         D and B after the sweep; the arguments are not written to.
@@ -58,37 +63,41 @@ def soup_dil_sweep(
 
     Source: Ravishankar, Nadakuditi, Fessler, "Efficient sum of outer products dictionary learning (SOUP-DIL)", 2015.
     """
-    _check(P, D, B, order, unused)
+    _check(P, D, B, order, unused, threshold)
     N, _, L = P.shape
-    threshold = _thresholds(mu, B)
+    levels = _levels(mu, B)
     if D.shape[0] == N or not learn:
-        D, B = _sweep(P, D.expand(N, -1, -1) if learn else D, B, threshold, bound, order, unused, learn)
+        D, B = _sweep(P, D.expand(N, -1, -1) if learn else D, B, levels, bound, order, unused, learn, threshold)
         return D, B
     # One dictionary for all: the patches of the batch side by side are the patches of one surface.
     side_by_side, codes = P.transpose(0, 1).flatten(1)[None], B.transpose(0, 1).flatten(1)[None]
-    if threshold.shape[0] > 1:
-        threshold = threshold.expand(N, -1, L).transpose(0, 1).flatten(1)[None]
-    D, codes = _sweep(side_by_side, D, codes, threshold, bound, order, unused, learn)
+    if levels.shape[0] > 1:
+        levels = levels.expand(N, -1, L).transpose(0, 1).flatten(1)[None]
+    D, codes = _sweep(side_by_side, D, codes, levels, bound, order, unused, learn, threshold)
     return D, codes[0].unflatten(1, (N, L)).transpose(0, 1)
 
 
-def hard_threshold(x: Tensor, mu: Tensor, bound: float = math.inf) -> Tensor:
-    """Minimiser of (b - x)^2 + mu^2 [b != 0]: x where |x| > mu strictly, else 0; then clipped to [-bound, bound]."""
-    kept = torch.where(x.abs() > mu, x, 0)
-    return kept if math.isinf(bound) else kept.clamp(-bound, bound)
-
-
 def _sweep(
-    P: Tensor, D: Tensor, B: Tensor, mu: Tensor, bound: float, order: Order, unused: Unused, learn: bool
+    P: Tensor,
+    D: Tensor,
+    B: Tensor,
+    mu: Tensor,
+    bound: float,
+    order: Order,
+    unused: Unused,
+    learn: bool,
+    rule: Threshold,
 ) -> tuple[Tensor, Tensor]:
     R = P - D @ B
     if order == "atom" and learn:
-        return _atom_order(R, D, B, mu, bound, unused)
-    R, B = _update_codes(R, D, B, mu, bound)
+        return _atom_order(R, D, B, mu, bound, unused, rule)
+    R, B = _update_codes(R, D, B, mu, bound, rule)
     return (_update_atoms(R, D, B, unused) if learn else D), B
 
 
-def _atom_order(R: Tensor, D: Tensor, B: Tensor, mu: Tensor, bound: float, unused: Unused) -> tuple[Tensor, Tensor]:
+def _atom_order(
+    R: Tensor, D: Tensor, B: Tensor, mu: Tensor, bound: float, unused: Unused, rule: Threshold
+) -> tuple[Tensor, Tensor]:
     """Row, atom, row, atom, ..: the residual R is brought up to date once per group, rows within the group exactly."""
     atoms: list[Tensor] = []
     rows: list[Tensor] = []
@@ -101,7 +110,7 @@ def _atom_order(R: Tensor, D: Tensor, B: Tensor, mu: Tensor, bound: float, unuse
         for k in range(D0.shape[-1]):
             d, b, m = D0[..., k : k + 1], B0[:, k : k + 1], mu[:, start + k : start + k + 1] if mu.shape[1] > 1 else mu
             x = X[:, k : k + 1] - (d.mT @ C) @ S
-            b_new = hard_threshold(x, m, bound)
+            b_new = shrink(x, m, bound, rule)
             h = R @ b_new.mT - C @ (S @ b_new.mT) + d * (b @ b_new.mT)
             d_new = _normalize(h, d, unused)
             C, S = torch.cat([C, d_new, -d], -1), torch.cat([S, b_new, b], 1)
@@ -113,7 +122,7 @@ def _atom_order(R: Tensor, D: Tensor, B: Tensor, mu: Tensor, bound: float, unuse
     return torch.cat(atoms, -1), torch.cat(rows, 1)
 
 
-def _update_codes(R: Tensor, D: Tensor, B: Tensor, mu: Tensor, bound: float) -> tuple[Tensor, Tensor]:
+def _update_codes(R: Tensor, D: Tensor, B: Tensor, mu: Tensor, bound: float, rule: Threshold) -> tuple[Tensor, Tensor]:
     """All rows of B in turn with D held fixed; returns the new residual and codes."""
     rows: list[Tensor] = []
     for start in range(0, D.shape[-1], _GROUP):
@@ -123,7 +132,7 @@ def _update_codes(R: Tensor, D: Tensor, B: Tensor, mu: Tensor, bound: float) -> 
         group_rows = []
         for k in range(D0.shape[-1]):
             m = mu[:, start + k : start + k + 1] if mu.shape[1] > 1 else mu
-            b_new = hard_threshold(X[:, k : k + 1] - G[:, k : k + 1, :k] @ change, m, bound)
+            b_new = shrink(X[:, k : k + 1] - G[:, k : k + 1, :k] @ change, m, bound, rule)
             change = torch.cat([change, b_new - B0[:, k : k + 1]], 1)
             group_rows.append(b_new)
         R = R - D0 @ change
@@ -162,18 +171,20 @@ def _normalize(h: Tensor, d: Tensor, unused: Unused) -> Tensor:
     return torch.where(some, h * torch.where(some, square, 1).rsqrt(), instead)
 
 
-def _thresholds(mu: float | Tensor, B: Tensor) -> Tensor:
+def _levels(mu: float | Tensor, B: Tensor) -> Tensor:
     """Mu as (N or 1, K or 1, 1)."""
     if not isinstance(mu, Tensor):
         return torch.full((1, 1, 1), float(mu), dtype=B.dtype, device=B.device)
     return (mu if mu.ndim == 2 else mu.reshape(1, -1)).to(B)[..., None]
 
 
-def _check(P: Tensor, D: Tensor, B: Tensor, order: str, unused: str) -> None:
+def _check(P: Tensor, D: Tensor, B: Tensor, order: str, unused: str, threshold: str) -> None:
     if order not in ("atom", "block"):
         raise ValueError(f"order: {order!r} is unknown; choose 'atom' or 'block'")
     if unused not in ("first", "keep"):
         raise ValueError(f"unused: {unused!r} is unknown; choose 'first' or 'keep'")
+    if threshold not in THRESHOLDS:
+        raise ValueError(f"threshold: {threshold!r} is unknown; choose from {', '.join(map(repr, THRESHOLDS))}")
     fits = P.ndim == D.ndim == B.ndim == 3 and D.shape[0] in (1, P.shape[0])
     if not fits or D.shape[1] != P.shape[1] or B.shape != (P.shape[0], D.shape[2], P.shape[2]):
         raise ValueError(

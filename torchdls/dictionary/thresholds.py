@@ -1,0 +1,44 @@
+r"""How a code is shrunk, and what it then costs: each rule is the minimiser of (b - x)^2 + penalty(b).
+
+| rule | b for x >= 0 (odd in x) | penalty |
+|---|---|---|
+| "hard" | x where x > mu, else 0 | mu^2 [b != 0] |
+| "soft" | max(x - mu, 0) | 2 mu \|b\| |
+| "firm" | 0 up to mu, 2 (x - mu) up to 2 mu, x beyond | 2 mu \|b\| - b^2/2 up to \|b\| = 2 mu, 2 mu^2 beyond |
+
+"hard" is the paper's. Its codes do not move with mu (the derivative is zero almost everywhere), so to train mu choose
+"soft" or "firm": both are continuous and have a derivative in mu. Soft shrinks every code by mu, firm leaves large ones
+alone. Sources: Donoho, Johnstone 1994; Gao, Bruce 1997 (firm); Zhang 2010 (its penalty, the minimax concave one).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+Threshold = Literal["hard", "soft", "firm"]
+THRESHOLDS: tuple[Threshold, ...] = ("hard", "soft", "firm")
+
+
+def shrink(x: Tensor, mu: Tensor, bound: float = math.inf, rule: Threshold = "hard") -> Tensor:
+    """Minimiser b of (b - x)^2 + penalty(b), clipped to [-bound, bound]; 0 where |x| = mu. Shapes broadcast."""
+    size = x.abs()
+    if rule == "hard":
+        b = torch.where(size > mu, x, 0)
+    else:
+        rest = torch.where(size > mu, x.sign() * (size - mu), 0)
+        b = rest if rule == "soft" else torch.where(size > 2 * mu, x, 2 * rest)
+    return b if math.isinf(bound) else b.clamp(-bound, bound)
+
+
+def penalty(b: Tensor, mu: Tensor, rule: Threshold = "hard") -> Tensor:
+    """What each code costs under the rule; the objective weighs the sum by lam."""
+    if rule == "hard":
+        return mu.square() * (b != 0)
+    size = b.abs()
+    if rule == "soft":
+        return 2 * mu * size
+    return torch.where(size < 2 * mu, 2 * mu * size - size.square() / 2, 2 * mu.square())
