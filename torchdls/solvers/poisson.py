@@ -155,7 +155,8 @@ def _present_edges(v: Tensor) -> Tensor:
 class _Solve(torch.autograd.Function):
     """z = H(w, r)^+ b by conjugate gradients, with the implicit derivative dz = H^+ (db - dH z).
 
-    Besides z and how the solve went, the outputs hold the gauge, so that the adjoint solve need not find it again.
+    It runs in the window of the pixels that have an edge or an anchor, outside of which z = 0. Besides z and how the
+    solve went, the outputs hold the gauge in that window, so that the adjoint solve need not find it again.
     """
 
     @staticmethod
@@ -168,6 +169,10 @@ class _Solve(torch.autograd.Function):
         share: Tensor | None,
         setting: _Setting,
     ) -> tuple[Tensor, ...]:
+        z = torch.zeros_like(b)
+        rows, columns = _live_window(w, r)
+        b, w, r = (t[..., rows, columns] for t in (b, w, r))
+        z0 = None if z0 is None else z0[..., rows, columns]
         gauge = free_constants(w, r) if labels is None or share is None else Gauge(labels, share)
         x, iterations, residual, converged = conjugate_gradients(
             _normal(w, r, setting),
@@ -179,8 +184,9 @@ class _Solve(torch.autograd.Function):
         )
         if not bool(converged.all()):
             _warn(residual, converged, setting)
+        z[..., rows, columns] = gauge.remove(x)
         # Views, since an input may not come back as it is.
-        return gauge.remove(x), iterations, residual, converged, *(t.view_as(t) for t in gauge)
+        return z, iterations, residual, converged, *(t.view_as(t) for t in gauge)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
@@ -224,6 +230,17 @@ class _Solve(torch.autograd.Function):
 
         outputs = _Solve.apply(*(fold(x, d) for x, d in zip(inputs, in_dims, strict=True)))
         return tuple(x.unflatten(0, (size, -1)) for x in outputs), (0,) * len(outputs)
+
+
+def _live_window(w: Tensor, r: Tensor) -> tuple[slice, slice]:
+    """The smallest rectangle that holds all pixels with an edge or an anchor, on any surface of the batch."""
+    live = ((edge_ends(w) + r) > 0).any(0)[0]
+
+    def span(hit: Tensor) -> slice:
+        found = hit.nonzero()
+        return slice(int(found[0]), int(found[-1]) + 1) if len(found) else slice(0, 1)
+
+    return span(live.any(1)), span(live.any(0))
 
 
 def _warn(residual: Tensor, converged: Tensor, setting: _Setting) -> None:
