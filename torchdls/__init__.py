@@ -24,8 +24,11 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.integrators import DLS as DLS
     from torchdls.integrators import INTEGRATORS as INTEGRATORS
     from torchdls.integrators import DLSResult as DLSResult
+    from torchdls.integrators import HarkerOLeary as HarkerOLeary
     from torchdls.integrators import Integrator as Integrator
     from torchdls.integrators import LeastSquares as LeastSquares
+    from torchdls.integrators import SpectralRegularization as SpectralRegularization
+    from torchdls.integrators import TikhonovRegularization as TikhonovRegularization
     from torchdls.integrators import dls_objective as dls_objective
     from torchdls.io import load_camera as load_camera
     from torchdls.io import load_field as load_field
@@ -65,6 +68,9 @@ _MODULE_OF = {
     "INTEGRATORS": "integrators",
     "Integrator": "integrators",
     "LeastSquares": "integrators",
+    "HarkerOLeary": "integrators",
+    "SpectralRegularization": "integrators",
+    "TikhonovRegularization": "integrators",
     "dls_objective": "integrators",
     # the parts they are made of
     "GradientOperator": "operators",

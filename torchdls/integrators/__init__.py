@@ -4,5 +4,17 @@ from torchdls._registry import INTEGRATORS
 from torchdls.integrators.base import Fields, Integrator
 from torchdls.integrators.dls import DLS, DLSResult, dls_objective
 from torchdls.integrators.least_squares import LeastSquares
+from torchdls.integrators.sylvester import HarkerOLeary, SpectralRegularization, TikhonovRegularization
 
-__all__ = ["DLS", "INTEGRATORS", "DLSResult", "Fields", "Integrator", "LeastSquares", "dls_objective"]
+__all__ = [
+    "DLS",
+    "DLSResult",
+    "Fields",
+    "HarkerOLeary",
+    "INTEGRATORS",
+    "Integrator",
+    "LeastSquares",
+    "SpectralRegularization",
+    "TikhonovRegularization",
+    "dls_objective",
+]
