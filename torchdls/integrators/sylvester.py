@@ -245,10 +245,10 @@ class TikhonovRegularization(GlobalLeastSquares):
 
     def _prior(self, prior: Tensor, gradient: Tensor) -> Tensor:
         name = type(self).__name__
-        prior = cast(Tensor, _fit(name, "prior", prior, gradient, channels=(1,)))
-        if not bool_all(prior.isfinite()):
+        fitted = cast(Tensor, _fit(name, "prior", prior, gradient, channels=(1,)))
+        if not bool_all(fitted.isfinite()):
             raise ValueError(f"{name}: prior {tuple(prior.shape)} is not finite")
-        return prior
+        return fitted
 
     def _slopes(self, z: Tensor, steps: tuple[float, float]) -> Tensor:
         """(N, 2, H, W) slopes Z D_x^T and D_y Z."""
