@@ -34,11 +34,12 @@ def dct_dictionary(
     Raises:
         ValueError: a size or the number of atoms is not positive.
     """
-    c_y, c_x = (patch_size, patch_size) if isinstance(patch_size, int) else patch_size
-    if c_y < 1 or c_x < 1:
-        raise ValueError(f"patch_size: {patch_size!r} given, positive integers are needed")
+    sides = (patch_size, patch_size) if isinstance(patch_size, int) else patch_size
+    if not isinstance(sides, tuple) or len(sides) != 2 or not all(isinstance(c, int) and c > 0 for c in sides):
+        raise ValueError(f"patch_size: {patch_size!r} given, a positive integer or a pair (rows, columns) is needed")
+    c_y, c_x = sides
     n_atoms = c_y * c_x if n_atoms is None else n_atoms
-    if n_atoms < 1:
+    if not isinstance(n_atoms, int) or n_atoms < 1:
         raise ValueError(f"n_atoms: {n_atoms!r} given, a positive integer is needed")
     if c_y == c_x == 1 < n_atoms:
         raise ValueError(f"n_atoms: {n_atoms} given, but a patch of one pixel has only the constant atom")

@@ -46,7 +46,7 @@ def soup_dil_sweep(
         P: (N, n, L) patches.
         D: (N, n, K) one dictionary per surface, or (1, n, K) one for the whole batch, learned from all its patches.
         B: (N, K, L) codes to start from.
-        mu: threshold, at least 0: a number, or a tensor that broadcasts to (N, K): (N, 1) per surface, (1, K) per atom.
+        mu: threshold, at least 0: a number, or a tensor that broadcasts to (N, K): (N, 1) per surface, (K,) per atom.
         bound: the bound a on the codes.
         order: "atom" or "block".
         unused: an atom whose row of codes is zero becomes the first unit vector e_1 ("first", as in the paper's
@@ -59,11 +59,12 @@ def soup_dil_sweep(
         D and B after the sweep; the arguments are not written to.
 
     Raises:
-        ValueError: shapes do not fit, or an option is unknown.
+        ValueError: shapes do not fit, an option is unknown, the bound is not positive, or a number mu is negative.
 
     Source: Ravishankar, Nadakuditi, Fessler, "Efficient sum of outer products dictionary learning (SOUP-DIL)", 2015.
     """
     _check(P, D, B, order, unused, threshold)
+    _check_levels(mu, bound, B)
     N, _, L = P.shape
     levels = _levels(mu, B)
     if D.shape[0] == N or not learn:
@@ -176,6 +177,18 @@ def _levels(mu: float | Tensor, B: Tensor) -> Tensor:
     if not isinstance(mu, Tensor):
         return torch.full((1, 1, 1), float(mu), dtype=B.dtype, device=B.device)
     return (mu if mu.ndim == 2 else mu.reshape(1, -1)).to(B)[..., None]
+
+
+def _check_levels(mu: float | Tensor, bound: float, B: Tensor) -> None:
+    if not bound > 0:
+        raise ValueError(f"bound: {bound!r} given, a positive number is needed")
+    N, K, _ = B.shape
+    if isinstance(mu, Tensor):
+        rows, columns = mu.shape if mu.ndim == 2 else (1, mu.numel())
+        if mu.ndim > 2 or rows not in (1, N) or columns not in (1, K):
+            raise ValueError(f"mu: {tuple(mu.shape)} given, it must broadcast to (N, K) = ({N}, {K})")
+    elif not mu >= 0:
+        raise ValueError(f"mu: {mu!r} given, a number of at least 0 is needed")
 
 
 def _check(P: Tensor, D: Tensor, B: Tensor, order: str, unused: str, threshold: str) -> None:

@@ -24,10 +24,12 @@ THRESHOLDS: tuple[Threshold, ...] = ("hard", "soft", "firm")
 
 
 def shrink(x: Tensor, mu: Tensor, bound: float = math.inf, rule: Threshold = "hard") -> Tensor:
-    """Minimiser b of (b - x)^2 + penalty(b), clipped to [-bound, bound]; 0 where |x| = mu. Shapes broadcast."""
+    """Minimiser b of (b - x)^2 + penalty(b) over [-bound, bound]; 0 where |x| = mu. Shapes broadcast."""
     size = x.abs()
     if rule == "hard":
-        b = torch.where(size > mu, x, 0)
+        # Beyond a bound below mu, a clipped code must still save mu^2: x^2 - (x - bound)^2 > mu^2.
+        cut = mu if math.isinf(bound) else torch.where(mu > bound, (mu.square() + bound**2) / (2 * bound), mu)
+        b = torch.where(size > cut, x, 0)
     else:
         rest = torch.where(size > mu, x.sign() * (size - mu), 0)
         b = rest if rule == "soft" else torch.where(size > 2 * mu, x, 2 * rest)
@@ -37,7 +39,7 @@ def shrink(x: Tensor, mu: Tensor, bound: float = math.inf, rule: Threshold = "ha
 def penalty(b: Tensor, mu: Tensor, rule: Threshold = "hard") -> Tensor:
     """What each code costs under the rule; the objective weighs the sum by lam."""
     if rule == "hard":
-        return mu.square() * (b != 0)
+        return torch.where(b != 0, mu.square(), 0)  # not a product: mu may be so large that its square is infinite
     size = b.abs()
     if rule == "soft":
         return 2 * mu * size

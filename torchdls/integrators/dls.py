@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchdls.dictionary import dct_dictionary, soup_dil_sweep
 from torchdls.dictionary.soup_dil import Order, Unused
+from torchdls.dictionary.thresholds import penalty
 from torchdls.integrators.base import Fields, Integrator
 from torchdls.integrators.least_squares import LeastSquares
 from torchdls.noise import noise_level
@@ -334,7 +335,7 @@ def dls_objective(
 def _patch_cost(P: Tensor, D: Tensor, B: Tensor, mu: Tensor, valid: Tensor | None) -> Tensor:
     misfit = (P - D @ B).square()
     fit = (misfit if valid is None else torch.where(valid, misfit, 0)).sum((1, 2))
-    return fit + mu.square() * (B != 0).sum((1, 2))
+    return fit + penalty(B, mu[:, None, None]).sum((1, 2))
 
 
 def _extend(z: Tensor, fields: Fields) -> Tensor:
