@@ -214,7 +214,7 @@ def test_other_numbers_of_atoms(size, factor):
     torch.testing.assert_close(D.norm(dim=0), torch.ones(K, dtype=torch.float64))
     torch.testing.assert_close(D[:, 0], torch.full((p * q,), (p * q) ** -0.5, dtype=torch.float64))
     assert (D[:, 1:].sum(0).abs() < 1e-12).all()
-    if K >= 1.7 * p * q:  # below, the highest frequency may be left out
+    if 1.7 * p * q <= K:  # below, the highest frequency may be left out
         assert torch.linalg.matrix_rank(D) == p * q
 
 

@@ -24,9 +24,12 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.integrators import DLS as DLS
     from torchdls.integrators import INTEGRATORS as INTEGRATORS
     from torchdls.integrators import DLSResult as DLSResult
+    from torchdls.integrators import FrankotChellappa as FrankotChellappa
     from torchdls.integrators import HarkerOLeary as HarkerOLeary
+    from torchdls.integrators import HornBrooks as HornBrooks
     from torchdls.integrators import Integrator as Integrator
     from torchdls.integrators import LeastSquares as LeastSquares
+    from torchdls.integrators import LineIntegral as LineIntegral
     from torchdls.integrators import SpectralRegularization as SpectralRegularization
     from torchdls.integrators import TikhonovRegularization as TikhonovRegularization
     from torchdls.integrators import dls_objective as dls_objective
@@ -68,7 +71,10 @@ _MODULE_OF = {
     "INTEGRATORS": "integrators",
     "Integrator": "integrators",
     "LeastSquares": "integrators",
+    "FrankotChellappa": "integrators",
     "HarkerOLeary": "integrators",
+    "HornBrooks": "integrators",
+    "LineIntegral": "integrators",
     "SpectralRegularization": "integrators",
     "TikhonovRegularization": "integrators",
     "dls_objective": "integrators",

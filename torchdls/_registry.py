@@ -50,6 +50,9 @@ class Registry(Mapping[str, Any]):
 INTEGRATORS = Registry(
     {
         "least_squares": "LeastSquares",
+        "frankot_chellappa": "FrankotChellappa",
+        "horn_brooks": "HornBrooks",
+        "line_integral": "LineIntegral",
         "harker_oleary": "HarkerOLeary",
         "spectral_regularization": "SpectralRegularization",
         "tikhonov_regularization": "TikhonovRegularization",

@@ -3,17 +3,23 @@
 from torchdls._registry import INTEGRATORS
 from torchdls.integrators.base import Fields, Integrator
 from torchdls.integrators.dls import DLS, DLSResult, dls_objective
+from torchdls.integrators.fourier import FrankotChellappa
+from torchdls.integrators.horn_brooks import HornBrooks
 from torchdls.integrators.least_squares import LeastSquares
+from torchdls.integrators.line_integral import LineIntegral
 from torchdls.integrators.sylvester import HarkerOLeary, SpectralRegularization, TikhonovRegularization
 
 __all__ = [
     "DLS",
     "DLSResult",
     "Fields",
+    "FrankotChellappa",
     "HarkerOLeary",
+    "HornBrooks",
     "INTEGRATORS",
     "Integrator",
     "LeastSquares",
+    "LineIntegral",
     "SpectralRegularization",
     "TikhonovRegularization",
     "dls_objective",

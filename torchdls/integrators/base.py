@@ -156,9 +156,12 @@ class Integrator(nn.Module):
 
 def bool_all(condition: Tensor) -> bool:
     """Whether a condition holds everywhere; True where values cannot be seen (in a traced graph, inside vmap)."""
-    if torch.compiler.is_compiling() or torch._C._functorch.is_batchedtensor(condition):
-        return True
-    return bool(condition.all())
+    return not visible(condition) or bool(condition.all())
+
+
+def visible(x: Tensor) -> bool:
+    """Whether values can be looked at: not in a traced graph, nor inside vmap."""
+    return not (torch.compiler.is_compiling() or torch._C._functorch.is_batchedtensor(x))
 
 
 def _require(holds: bool, message: str) -> None:
