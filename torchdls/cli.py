@@ -309,7 +309,7 @@ def _demo(arguments: argparse.Namespace) -> None:
     from torchdls.surfaces import SURFACES, terrain
 
     size = () if arguments.size is None else (arguments.size,)
-    surfaces = ("Tent", SURFACES["tent"](*size), 1.0), ("Terrain", terrain(*size), 0.0)
+    surfaces = ("Tent", SURFACES["tent"](*size), 1.0), ("Terrain", terrain(*size, smoothing=2.0), 0.0)
     folder = Path(arguments.out)
     folder.mkdir(parents=True, exist_ok=True)
     print(f"{'surface':<10}{'SNR':>5}  {'method':<14}{'RMSE':>9}{'SSIM':>8}{'angle':>9}{'seconds':>9}")

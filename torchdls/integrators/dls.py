@@ -18,9 +18,10 @@ from torchdls.noise import noise_level
 from torchdls.operators import GradientOperator, Patches
 from torchdls.solvers import harmonic_extension, solve
 
-# Found by benchmarks/quality.py: lam is a plateau from here on, mu is in units of the noise of one gradient sample.
+# lam is a plateau from here on; one standard deviation of the noise is safe on textured relief and on smooth surfaces
+# alike (benchmarks/quality.py).
 _AUTO_LAM = 0.5
-_AUTO_MU = 1.5
+_AUTO_MU = 1.0
 
 Callback = Callable[[int, Tensor], None]
 
@@ -71,7 +72,7 @@ class DLS(Integrator):
         stride: step between patches, at most the patch size.
         n_atoms: K, the number of atoms of the initial DCT dictionary; ignored if `dictionary` is given.
         lam: weight of the patch model; a number, a tensor (a number or one per surface), or "auto" (0.5).
-        mu: threshold on the codes; a number, a tensor (a number or one per surface), or "auto": 1.5 times the noise
+        mu: threshold on the codes; a number, a tensor (a number or one per surface), or "auto": the noise
         level
             of one gradient sample, which `noise_level` estimates from the non-integrable part of each field.
         n_iter: limit of iterations.
@@ -108,7 +109,7 @@ class DLS(Integrator):
         n_atoms: int = 64,
         lam: float | Tensor | Literal["auto"] = "auto",
         mu: float | Tensor | Literal["auto"] = "auto",
-        n_iter: int = 100,
+        n_iter: int = 50,
         data_term: Integrator | None = None,
         dictionary: Tensor | None = None,
         z_step: Literal["exact", "proximal"] = "exact",
