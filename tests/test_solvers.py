@@ -140,6 +140,7 @@ def test_the_warning_points_at_the_line_that_called():
 
 def test_surfaces_of_a_batch_do_not_touch_each_other():
     inside = torch.cat([MASKS["disk"](20, 20), MASKS["sieve"](20, 20), torch.ones(1, 1, 20, 20, dtype=torch.bool)])
+    inside[..., :1, :2] = inside[..., -1:, -2:] = True  # each reaches the corners: the same window, together or alone
     g = random_field(3, 2, 20, 20) * torch.tensor([1e-6, 1.0, 1e6], dtype=torch.float64)[:, None, None, None]
     v, w = edge_slopes(g, inside)
     together = solve(v, w, tol=1e-6)
@@ -147,6 +148,18 @@ def test_surfaces_of_a_batch_do_not_touch_each_other():
         alone = solve(v[n : n + 1], w[n : n + 1], tol=1e-6)
         assert int(together.iterations[n]) == int(alone.iterations)
         torch.testing.assert_close(together.height[n : n + 1], alone.height, rtol=1e-9, atol=0)
+
+
+def test_a_larger_window_of_the_batch_changes_nothing_beyond_the_tolerance():
+    inside = torch.zeros(2, 1, 30, 24, dtype=torch.bool)
+    inside[0, :, 3:9, 12:20] = True
+    inside[1, :, 20:29, 2:11] = True
+    v, w = edge_slopes(random_field(2, 2, 30, 24), inside)
+    together = solve(v, w, tol=1e-12)
+    for n in range(2):
+        alone = solve(v[n : n + 1], w[n : n + 1], tol=1e-12)
+        torch.testing.assert_close(together.height[n : n + 1], alone.height, rtol=0, atol=1e-10)
+    assert bool((together.height[~inside] == 0).all())
 
 
 def test_float32_converges_to_its_precision():

@@ -12,8 +12,8 @@ class Gauge(NamedTuple):
     """The null space of (*): one constant on every connected component that no anchor holds.
 
     Attributes:
-        labels: (N, H * W) int64, the same number on all pixels of a component.
-        share: (N, H * W), 1 / size of the pixel's component, or 0 where an anchor fixes its height.
+        labels: (N, H * W) int64, the same number on all pixels of a component; (N, 0) where anchors hold every pixel.
+        share: (N, H * W), 1 / size of the pixel's component, or 0 where an anchor fixes its height; (N, 0) likewise.
     """
 
     labels: Tensor
@@ -21,6 +21,8 @@ class Gauge(NamedTuple):
 
     def remove(self, x: Tensor) -> Tensor:
         """Orthogonal projection of x (N, 1, H, W) on zero mean over each free component."""
+        if self.labels.shape[1] == 0:
+            return x
         flat = x.flatten(1)
         sums = torch.zeros_like(flat).scatter_add(1, self.labels, flat)
         return (flat - sums.gather(1, self.labels) * self.share).view_as(x)
@@ -63,6 +65,8 @@ def _roots(parent: Tensor) -> Tensor:
 
 def free_constants(w: Tensor, r: Tensor | None) -> Gauge:
     """The gauge of (*) with edge weights w (N, 2, H, W) and anchor weights r (N, 1, H, W) or None."""
+    if r is not None and bool((r > 0).all()):  # as in every z-step of DLS on a full rectangle
+        return Gauge(torch.empty_like(w[:, 0, :0, 0], dtype=torch.int64), w[:, 0, :0, 0].clone())
     labels = connected_components(w > 0).flatten(1)
     ones = torch.ones_like(labels, dtype=w.dtype)
     size = torch.zeros_like(ones).scatter_add(1, labels, ones)
