@@ -133,7 +133,9 @@ def test_float32_keeps_up_with_float64():
         exact = soup_dil_sweep(P, D, B, 0.5, order=order)
         rough = soup_dil_sweep(P.float(), D.float(), B.float(), 0.5, order=order)
         assert rough[0].dtype == rough[1].dtype == torch.float32
-        assert (rough[0] - exact[0]).abs().max() < 2e-3
+        # A code within rounding of mu may fall on either side and take its atom along, but neither costs more.
+        costs = [(P - d.double() @ b.double()).square().sum() + 0.25 * b.count_nonzero() for d, b in (exact, rough)]
+        torch.testing.assert_close(costs[1], costs[0], rtol=1e-3, atol=0)
 
 
 def test_arguments_are_left_alone():

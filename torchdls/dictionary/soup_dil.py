@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import Literal
+from collections.abc import Iterable, Sequence
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchdls._tape import recorded
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold, shrink
 
 Order = Literal["atom", "block"]
 Unused = Literal["first", "keep"]
 
 # Atoms that share one product with the residual; inside such a group they are corrected for each other one by one.
-_GROUP = 8
+_GROUP = 16
+
+# Patches that the block order takes at once (over the whole batch), and the fewest of one surface: long enough that
+# the loop over the atoms costs little, short enough that its temporaries do.
+_CHUNK, _SHORTEST = 65536, 4096
 
 
 def soup_dil_sweep(
@@ -65,118 +72,171 @@ def soup_dil_sweep(
     """
     _check(P, D, B, order, unused, threshold)
     _check_levels(mu, bound, B)
-    N, _, L = P.shape
-    levels = _levels(mu, B)
-    if D.shape[0] == N or not learn:
-        D, B = _sweep(P, D.expand(N, -1, -1) if learn else D, B, levels, bound, order, unused, learn, threshold)
-        return D, B
-    # One dictionary for all: the patches of the batch side by side are the patches of one surface.
-    side_by_side, codes = P.transpose(0, 1).flatten(1)[None], B.transpose(0, 1).flatten(1)[None]
-    if levels.shape[0] > 1:
-        levels = levels.expand(N, -1, L).transpose(0, 1).flatten(1)[None]
-    D, codes = _sweep(side_by_side, D, codes, levels, bound, order, unused, learn, threshold)
-    return D, codes[0].unflatten(1, (N, L)).transpose(0, 1)
+    R = P - D @ B
+    B = B if recorded(R, D, B) else B.clone()
+    _, D, B = residual_sweep(R, D, B, mu, bound, order, unused=unused, learn=learn, threshold=threshold)
+    return D, B
 
 
-def _sweep(
-    P: Tensor,
+def residual_sweep(
+    R: Tensor,
     D: Tensor,
     B: Tensor,
-    mu: Tensor,
-    bound: float,
-    order: Order,
-    unused: Unused,
-    learn: bool,
-    rule: Threshold,
-) -> tuple[Tensor, Tensor]:
-    R = P - D @ B
+    mu: float | Tensor,
+    bound: float = math.inf,
+    order: Order = "atom",
+    *,
+    unused: Unused = "first",
+    learn: bool = True,
+    threshold: Threshold = "hard",
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`soup_dil_sweep` for a caller who keeps the residual R = P - D B (N, n, L) instead of the patches.
+
+    Returns:
+        R, D and B after the sweep. Where no derivative is recorded, R and B are overwritten: no second copy is made.
+    """
+    in_place = not recorded(R, D, B, *([mu] if isinstance(mu, Tensor) else []))
+    rule = _Rule(_levels(mu, B, in_place), bound, threshold, unused, in_place)
     if order == "atom" and learn:
-        return _atom_order(R, D, B, mu, bound, unused, rule)
-    R, B = _update_codes(R, D, B, mu, bound, rule)
-    return (_update_atoms(R, D, B, unused) if learn else D), B
+        return _atom_order(R, D, B, rule)
+    return _block_order(R, D, B, rule, learn)
 
 
-def _atom_order(
-    R: Tensor, D: Tensor, B: Tensor, mu: Tensor, bound: float, unused: Unused, rule: Threshold
-) -> tuple[Tensor, Tensor]:
-    """Row, atom, row, atom, ..: the residual R is brought up to date once per group, rows within the group exactly."""
-    atoms: list[Tensor] = []
-    rows: list[Tensor] = []
-    for start in range(0, D.shape[-1], _GROUP):
-        D0, B0 = D[..., start : start + _GROUP], B[:, start : start + _GROUP]
-        X = D0.mT @ R + B0
-        # What the group has changed so far: R - C S is the residual of the moment, with C (N, n, 2k) and S (N, 2k, L).
-        C, S = D0[..., :0], B0[:, :0]
-        group_atoms, group_rows = [], []
-        for k in range(D0.shape[-1]):
-            d, b, m = D0[..., k : k + 1], B0[:, k : k + 1], mu[:, start + k : start + k + 1] if mu.shape[1] > 1 else mu
-            x = X[:, k : k + 1] - (d.mT @ C) @ S
-            b_new = shrink(x, m, bound, rule)
-            h = R @ b_new.mT - C @ (S @ b_new.mT) + d * (b @ b_new.mT)
-            d_new = _normalize(h, d, unused)
-            C, S = torch.cat([C, d_new, -d], -1), torch.cat([S, b_new, b], 1)
-            group_atoms.append(d_new)
-            group_rows.append(b_new)
-        R = R - C @ S
-        atoms += group_atoms
-        rows += group_rows
-    return torch.cat(atoms, -1), torch.cat(rows, 1)
+class _Rule(NamedTuple):
+    """How codes are shrunk and atoms normalised; `in_place` where nothing is recorded."""
+
+    levels: Sequence[float | Tensor]
+    bound: float
+    threshold: Threshold
+    unused: Unused
+    in_place: bool
+
+    def shrink(self, x: Tensor, atom: int) -> Tensor:
+        return shrink(x, self.levels[atom], self.bound, self.threshold)
+
+    def add_product(self, x: Tensor, a: Tensor, b: Tensor, sign: int = 1) -> Tensor:
+        """X + sign a b, written to x where nothing is recorded."""
+        a = a.expand(x.shape[0], -1, -1)
+        return x.baddbmm_(a, b, alpha=sign) if self.in_place else torch.baddbmm(x, a, b, alpha=sign)
+
+    def join(self, pieces: list[Tensor], dim: int, into: Tensor) -> Tensor:
+        """The pieces of `into`, put together again; they are already there where nothing is recorded."""
+        return into if self.in_place else torch.cat(pieces, dim)
 
 
-def _update_codes(R: Tensor, D: Tensor, B: Tensor, mu: Tensor, bound: float, rule: Threshold) -> tuple[Tensor, Tensor]:
+def _block_order(R: Tensor, D: Tensor, B: Tensor, rule: _Rule, learn: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """All codes with D held fixed, then all atoms with B held fixed.
+
+    The codes of a patch do not depend on other patches, so they are updated chunk by chunk; what the atoms need of
+    them, R B^T and B B^T, is summed on the way.
+    """
+    shared = D.shape[0] < R.shape[0]
+    length = R.shape[-1] if not rule.in_place else max(_CHUNK // R.shape[0], _SHORTEST)
+    chunks = [_update_codes(r, D, b, rule) for r, b in zip(R.split(length, -1), B.split(length, -1), strict=True)]
+    residuals, codes = [r for r, _ in chunks], [b for _, b in chunks]
+    if learn:
+        H, C = _total((r @ b.mT for r, b in chunks), shared), _total((b @ b.mT for b in codes), shared)
+        D_new = _update_atoms(H, C, D, rule)
+        residuals = [rule.add_product(r, D - D_new, b) for r, b in zip(residuals, codes, strict=True)]
+        D = D_new
+    return rule.join(residuals, -1, R), D, rule.join(codes, -1, B)
+
+
+def _total(products: Iterable[Tensor], shared: bool) -> Tensor:
+    total = functools.reduce(torch.add, products)
+    return total.sum(0, keepdim=True) if shared else total
+
+
+def _update_codes(R: Tensor, D: Tensor, B: Tensor, rule: _Rule) -> tuple[Tensor, Tensor]:
     """All rows of B in turn with D held fixed; returns the new residual and codes."""
-    rows: list[Tensor] = []
+    groups = []
     for start in range(0, D.shape[-1], _GROUP):
         D0, B0 = D[..., start : start + _GROUP], B[:, start : start + _GROUP]
-        X, G = D0.mT @ R + B0, D0.mT @ D0
-        change = B0[:, :0]
-        group_rows = []
+        rest, G = torch.baddbmm(B0, D0.mT.expand(R.shape[0], -1, -1), R), D0.mT @ D0
+        rows = []
         for k in range(D0.shape[-1]):
-            m = mu[:, start + k : start + k + 1] if mu.shape[1] > 1 else mu
-            b_new = shrink(X[:, k : k + 1] - G[:, k : k + 1, :k] @ change, m, bound, rule)
-            change = torch.cat([change, b_new - B0[:, k : k + 1]], 1)
-            group_rows.append(b_new)
-        R = R - D0 @ change
-        rows += group_rows
-    return R, torch.cat(rows, 1)
+            row = rule.shrink(rest[:, :1], start + k)
+            # What the row has changed is taken from the rows of the group that are still to come.
+            rest = rule.add_product(rest[:, 1:], G[:, k + 1 :, k : k + 1], B0[:, k : k + 1] - row)
+            rows.append(row)
+        codes = torch.cat(rows, 1)
+        R = rule.add_product(R, D0, B0 - codes)
+        groups.append(B0.copy_(codes) if rule.in_place else codes)
+    return R, rule.join(groups, 1, B)
 
 
-def _update_atoms(R: Tensor, D: Tensor, B: Tensor, unused: Unused) -> Tensor:
-    """All atoms in turn with B held fixed.
+def _update_atoms(H: Tensor, C: Tensor, D: Tensor, rule: _Rule) -> Tensor:
+    """All atoms in turn with B held fixed, from H = R B^T and C = B B^T.
 
     h_i = R b_i^T + d_i ||b_i||^2 with the residual of the moment, which the atoms before i have changed by their own
     steps. Through the residual, and not through P B^T, nothing large cancels: float32 stays accurate.
     """
-    H, C = R @ B.mT, B @ B.mT
-    steps = D[..., :0]
-    atoms: list[Tensor] = []
+    rest = H + D * C.diagonal(dim1=-2, dim2=-1)[:, None]
+    atoms = []
     for i in range(D.shape[-1]):
-        d = D[..., i : i + 1]
-        h = H[..., i : i + 1] - steps @ C[:, :i, i : i + 1] + d * C[:, i : i + 1, i : i + 1]
-        used = C[:, i : i + 1, i : i + 1] > 0
-        d_new = _normalize(torch.where(used, h, 0), d, unused)
-        steps = torch.cat([steps, d_new - d], -1)
-        atoms.append(d_new)
-    return torch.cat(atoms, -1)
+        atom = _normalize(rest[..., :1])
+        step = atom - D[..., i : i + 1]
+        rest = rule.add_product(rest[..., 1:], step, C[:, i : i + 1, i + 1 :], -1)
+        atoms.append(atom)
+    return _where_used(torch.cat(atoms, -1), D, rule.unused)
 
 
-def _normalize(h: Tensor, d: Tensor, unused: Unused) -> Tensor:
-    """h / ||h|| for each surface, and the documented rule where h = 0; safe in the derivative too."""
-    square = h.square().sum(1, keepdim=True)
-    some = square > 0
+def _atom_order(R: Tensor, D: Tensor, B: Tensor, rule: _Rule) -> tuple[Tensor, Tensor, Tensor]:
+    """Row, atom, row, atom, ..: the residual R is brought up to date once per group, rows within the group exactly."""
+    shared = D.shape[0] < R.shape[0]
+    if rule.in_place:
+        R = R.mT.contiguous().mT  # patch by patch: the patches that use an atom are gathered in whole cache lines
+    groups, atoms = [], []
+    for start in range(0, D.shape[-1], _GROUP):
+        D0, B0 = D[..., start : start + _GROUP], B[:, start : start + _GROUP]
+        rest = torch.baddbmm(B0, D0.mT.expand(R.shape[0], -1, -1), R)
+        # What the group has changed so far: R - C S is the residual of the moment, with C (N, n, 2k) and S (N, 2k, L).
+        C, S = D0[..., :0], B0[:, :0]
+        for k in range(D0.shape[-1]):
+            d, b = D0[..., k : k + 1], B0[:, k : k + 1]
+            row = rule.shrink(rest[:, :1], start + k)
+            h = _times_sparse(R, row, rule.in_place) - C @ (S @ row.mT) + d * (b @ row.mT)
+            atom = _where_used(_normalize(h.sum(0, keepdim=True) if shared else h), d, rule.unused)
+            pair, change = torch.cat([atom, -d], -1), torch.cat([row, b], 1)
+            rest = rule.add_product(rest[:, 1:], D0[..., k + 1 :].mT @ pair, change, -1)
+            C, S = torch.cat([C, pair], -1), torch.cat([S, change], 1)
+            atoms.append(atom)
+        R = rule.add_product(R, C, S, -1)
+        groups.append(B0.copy_(S[:, ::2]) if rule.in_place else S[:, ::2])
+    return R, torch.cat(atoms, -1), rule.join(groups, 1, B)
+
+
+def _times_sparse(R: Tensor, b: Tensor, look: bool) -> Tensor:
+    """R b^T, from the patches with a nonzero code alone where one surface makes that worth the search."""
+    if not look or R.shape[0] > 1:
+        return R @ b.mT
+    used = b[0, 0].nonzero()[:, 0]
+    return (R[0].mT.index_select(0, used).mT @ b[0, 0].index_select(0, used))[None, :, None]
+
+
+def _normalize(h: Tensor) -> Tensor:
+    """h / ||h|| for each surface, 0 where h = 0; safe in the derivative too."""
+    return h / torch.linalg.vector_norm(h, dim=1, keepdim=True).clamp(min=torch.finfo(h.dtype).tiny)
+
+
+def _where_used(atoms: Tensor, D: Tensor, unused: Unused) -> Tensor:
+    """Unit-norm atoms as they are; for atoms that came out 0, since no patch uses them, the documented rule."""
     if unused == "keep":
-        instead = d
+        instead = D
     else:
-        instead = torch.zeros_like(d)
+        instead = torch.zeros_like(D)
         instead[:, 0] = 1
-    return torch.where(some, h * torch.where(some, square, 1).rsqrt(), instead)
+    return torch.where((atoms != 0).any(1, keepdim=True), atoms, instead)
 
 
-def _levels(mu: float | Tensor, B: Tensor) -> Tensor:
-    """Mu as (N or 1, K or 1, 1)."""
-    if not isinstance(mu, Tensor):
-        return torch.full((1, 1, 1), float(mu), dtype=B.dtype, device=B.device)
-    return (mu if mu.ndim == 2 else mu.reshape(1, -1)).to(B)[..., None]
+def _levels(mu: float | Tensor, B: Tensor, look: bool) -> Sequence[float | Tensor]:
+    """The threshold of each atom: (N or 1, 1, 1), or a number where all surfaces share one that can be seen."""
+    mu = mu if isinstance(mu, Tensor) else torch.tensor(float(mu), dtype=B.dtype, device=B.device)
+    mu = (mu if mu.ndim == 2 else mu.reshape(1, -1)).to(B)
+    mu = mu.expand(mu.shape[0], B.shape[1])
+    if look and mu.shape[0] == 1:
+        return mu[0].tolist()
+    return [column[..., None] for column in mu.split(1, 1)]
 
 
 def _check_levels(mu: float | Tensor, bound: float, B: Tensor) -> None:

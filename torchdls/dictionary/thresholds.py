@@ -23,17 +23,28 @@ Threshold = Literal["hard", "soft", "firm"]
 THRESHOLDS: tuple[Threshold, ...] = ("hard", "soft", "firm")
 
 
-def shrink(x: Tensor, mu: Tensor, bound: float = math.inf, rule: Threshold = "hard") -> Tensor:
+def shrink(x: Tensor, mu: float | Tensor, bound: float = math.inf, rule: Threshold = "hard") -> Tensor:
     """Minimiser b of (b - x)^2 + penalty(b) over [-bound, bound]; 0 where |x| = mu. Shapes broadcast."""
-    size = x.abs()
     if rule == "hard":
-        # Beyond a bound below mu, a clipped code must still save mu^2: x^2 - (x - bound)^2 > mu^2.
-        cut = mu if math.isinf(bound) else torch.where(mu > bound, (mu.square() + bound**2) / (2 * bound), mu)
-        b = torch.where(size > cut, x, 0)
+        cut = _cut(mu, bound)
+        b = torch.hardshrink(x, cut) if isinstance(cut, float) else torch.where(x.abs() > cut, x, 0)
     else:
+        size = x.abs()
         rest = torch.where(size > mu, x.sign() * (size - mu), 0)
         b = rest if rule == "soft" else torch.where(size > 2 * mu, x, 2 * rest)
     return b if math.isinf(bound) else b.clamp(-bound, bound)
+
+
+def _cut(mu: float | Tensor, bound: float) -> float | Tensor:
+    """Up to where a code is cut: mu, but beyond a bound below mu a clipped code must still save mu^2.
+
+    There x^2 - (x - bound)^2 > mu^2.
+    """
+    if math.isinf(bound):
+        return mu
+    if isinstance(mu, float):
+        return (mu**2 + bound**2) / (2 * bound) if mu > bound else mu
+    return torch.where(mu > bound, (mu.square() + bound**2) / (2 * bound), mu)
 
 
 def penalty(b: Tensor, mu: Tensor, rule: Threshold = "hard") -> Tensor:
@@ -44,3 +55,11 @@ def penalty(b: Tensor, mu: Tensor, rule: Threshold = "hard") -> Tensor:
     if rule == "soft":
         return 2 * mu * size
     return torch.where(size < 2 * mu, 2 * mu * size - size.square() / 2, 2 * mu.square())
+
+
+def total_penalty(B: Tensor, mu: Tensor, rule: Threshold = "hard") -> Tensor:
+    """(N,) the penalties of all codes (N, K, L) of each surface, with one mu (N,) for each."""
+    if rule == "hard":
+        count = B.count_nonzero((1, 2))
+        return torch.where(count > 0, mu.square() * count, 0)
+    return penalty(B, mu[:, None, None], rule).sum((1, 2))

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torchdls._tape import visible
 from torchdls.operators import GradientOperator, as_pixel_size, edge_slopes
 
 
@@ -101,9 +102,7 @@ class Integrator(nn.Module):
 
     def data_cost(self, fields: Fields, z: Tensor) -> Tensor:
         """(N,) the data term at z."""
-        v, w = self.edges(fields)
-        misfit = (GradientOperator("forward", fields.steps)(z) - v).square()
-        return 0.5 * (misfit if w is None else w * misfit).sum((-3, -2, -1))
+        return edge_cost(z, *self.edges(fields), fields.steps)
 
     @property
     def unit(self) -> float:
@@ -154,14 +153,15 @@ class Integrator(nn.Module):
         return Fields(gradient, mask, weight, scaled, None if trust is None else trust * h**2, steps)
 
 
+def edge_cost(z: Tensor, v: Tensor, w: Tensor | None, steps: tuple[float, float]) -> Tensor:
+    """(N,) 1/2 sum w (A z - v)^2."""
+    misfit = (GradientOperator("forward", steps)(z) - v).square()
+    return 0.5 * (misfit if w is None else w * misfit).sum((-3, -2, -1))
+
+
 def bool_all(condition: Tensor) -> bool:
     """Whether a condition holds everywhere; True where values cannot be seen (in a traced graph, inside vmap)."""
     return not visible(condition) or bool(condition.all())
-
-
-def visible(x: Tensor) -> bool:
-    """Whether values can be looked at: not in a traced graph, nor inside vmap."""
-    return not (torch.compiler.is_compiling() or torch._C._functorch.is_batchedtensor(x))
 
 
 def _require(holds: bool, message: str) -> None:

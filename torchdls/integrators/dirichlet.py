@@ -6,7 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchdls.integrators.base import Fields, visible
+from torchdls._tape import visible
+from torchdls.integrators.base import Fields
 from torchdls.operators import GradientOperator, dirichlet_eigenvalues, dst2, edge_slopes
 from torchdls.solvers import SolveResult, solve
 

@@ -9,10 +9,11 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchdls.dictionary import dct_dictionary, soup_dil_sweep
-from torchdls.dictionary.soup_dil import Order, Unused
-from torchdls.dictionary.thresholds import penalty
-from torchdls.integrators.base import Fields, Integrator
+from torchdls._tape import visible
+from torchdls.dictionary import dct_dictionary
+from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
+from torchdls.integrators.base import Fields, Integrator, edge_cost
+from torchdls.integrators.dls_state import Model, Part, State, merge, patch_cost
 from torchdls.integrators.least_squares import LeastSquares
 from torchdls.noise import noise_level
 from torchdls.operators import GradientOperator, Patches
@@ -188,33 +189,62 @@ class DLS(Integrator):
 
     def _run(self, fields: Fields, callback: Callback | None) -> DLSResult:
         model = self._model(fields)
-        z = start = self.data_term.integrate(fields)
-        D = self._initial_dictionary(fields)
-        P = model.patches.extract(z)
-        B = P.new_zeros(P.shape[0], D.shape[-1], P.shape[-1])
-        fill = None if model.valid is None else model.patches.extract(_extend(z, fields))
-        objective = [self._objective(model, z, P, D, B)]
+        state = self._start(model)
+        objective = [self._objective(model, state)]
         active = torch.ones_like(model.noise, dtype=torch.bool)
+        running, parts = model, [Part(torch.arange(len(active), device=active.device), state)]
+        look = self.tol > 0 and visible(fields.gradient)
         for iteration in range(1, self.n_iter + 1):
-            D_new, B_new = self._sweeps(model, P, D, B, fill)
-            E = D_new @ B_new
-            z_new = self._step(model, z, E)
-            settled = (z_new - z).flatten(1).norm(dim=1) <= self.tol * (z_new - start).flatten(1).norm(dim=1)
-            z = _choose(active, z_new, z)
-            B = _choose(active, B_new, B)
-            D = _choose(active, D_new, D) if D.shape[0] == len(active) else D_new
-            fill = E
-            P = model.patches.extract(z)
-            objective.append(self._objective(model, z, P, D, B))
+            index, old = parts[-1]
+            new = self._iterate(running, old)
+            settled = self._settled(new, old)
+            if not look:  # every surface stays in the batch, and those that have settled do not move
+                new = old.choose(active, new) if self.tol > 0 else new
+            parts[-1] = Part(index, new)
+            value = self._objective(running, new)
+            objective.append(value if len(index) == len(active) else objective[-1].index_copy(0, index, value))
             if callback is not None:
                 callback(iteration, objective[-1].detach())
-            active = active & ~settled
-            if self.tol > 0 and not bool(active.any()):
-                break
+            active = active & ~settled if len(index) == len(active) else active.index_copy(0, index, ~settled)
+            if look and bool(settled.any()):  # what has settled leaves the batch
+                if bool(settled.all()):
+                    break
+                parts[-1:] = [Part(index[keep], new.part(keep)) for keep in (settled, ~settled)]
+                running = running.part(~settled)
         objective += [objective[-1]] * (self.n_iter + 1 - len(objective))
-        return DLSResult(z, D, B, torch.stack(objective, 1), model.noise, model.lam, model.mu, ~active)
+        end = merge(parts)
+        return DLSResult(end.z, end.D, end.B, torch.stack(objective, 1), model.noise, model.lam, model.mu, ~active)
 
-    def _model(self, fields: Fields) -> _Model:
+    def _start(self, model: Model) -> State:
+        """Heights of the data term alone, and no codes: the patches are the residual."""
+        z = self.data_term.integrate(model.fields)
+        D = self._initial_dictionary(model.fields)
+        if model.valid is None:
+            R = model.patches.extract(z)
+        else:
+            some = model.valid.any(1, keepdim=True)
+            R = torch.where(some, model.patches.extract(_extend(z, model.fields)), 0)
+        return State(z, z, R, D, R.new_zeros(R.shape[0], D.shape[-1], R.shape[-1]))
+
+    def _iterate(self, model: Model, state: State) -> State:
+        """One round: codes and atoms, then the height."""
+        R, D, B = state.R, state.D, state.B
+        for _ in range(self.n_sweeps):
+            R, D, B = residual_sweep(
+                R, D, B, model.mu[:, None], self.bound, self.order, unused=self.unused, learn=self.learn != "fixed"
+            )
+            # Filling the invalid pixels of a patch by its approximation D b means: no residual there.
+            R = R if model.valid is None else torch.where(model.valid, R, 0)
+        z = self._step(model, state.z, R)
+        return State(state.start, z, model.patches.extract_onto(R, z - state.z), D, B)
+
+    def _settled(self, new: State, old: State) -> Tensor:
+        """(N,) bool: the step was short. With one dictionary for all, a surface has settled once all have."""
+        step, way = ((z).flatten(1).norm(dim=1) for z in (new.z - old.z, new.z - new.start))
+        settled = step <= self.tol * way
+        return settled.all().expand_as(settled) if self.learn == "shared" else settled
+
+    def _model(self, fields: Fields) -> Model:
         """Everything that stays the same during the iterations."""
         gradient, mask = fields.gradient, fields.mask
         shape, N = gradient.shape[-2:], gradient.shape[0]
@@ -222,10 +252,13 @@ class DLS(Integrator):
         lam = _per_surface("lam", self.lam, _AUTO_LAM * torch.ones_like(noise))
         mu = _per_surface("mu", self.mu, _AUTO_MU * noise)
         coverage = self.patches.coverage(shape, dtype=gradient.dtype, device=gradient.device)
+        kind = type(self.data_term)
+        settled = kind.edges is Integrator.edges and kind.data_cost is Integrator.data_cost
+        edges = self.data_term.edges(fields) if settled else None
         if mask is None:
-            return _Model(fields, self.patches, coverage, None, noise, lam, mu)
+            return Model(fields, self.patches, coverage, None, edges, noise, lam, mu)
         valid = self.patches.extract(mask.to(gradient.dtype)) > 0
-        return _Model(fields, self.patches, coverage * mask, valid.expand(N, -1, -1), noise, lam, mu)
+        return Model(fields, self.patches, coverage * mask, valid.expand(N, -1, -1), edges, noise, lam, mu)
 
     def _initial_dictionary(self, fields: Fields) -> Tensor:
         D = self.dictionary.to(fields.gradient)
@@ -236,23 +269,13 @@ class DLS(Integrator):
         D = D / D.norm(dim=1, keepdim=True)
         return D.expand(N, -1, -1) if self.learn == "each" else D
 
-    def _sweeps(self, model: _Model, P: Tensor, D: Tensor, B: Tensor, fill: Tensor | None) -> tuple[Tensor, Tensor]:
-        for sweep in range(self.n_sweeps):
-            if model.valid is not None and fill is not None:
-                fill = D @ B if sweep else fill
-                P = torch.where(model.valid, P, torch.where(model.valid.any(1, keepdim=True), fill, 0))
-            D, B = soup_dil_sweep(
-                P, D, B, model.mu[:, None], self.bound, self.order, unused=self.unused, learn=self.learn != "fixed"
-            )
-        return D, B
-
-    def _step(self, model: _Model, z: Tensor, E: Tensor) -> Tensor:
-        """The height for given patches E = D B."""
+    def _step(self, model: Model, z: Tensor, R: Tensor) -> Tensor:
+        """The height for given patches D B = P - R."""
         fields = model.fields
-        v, w = self.data_term.edges(fields, z)
+        v, w = model.edges or self.data_term.edges(fields, z)
         strength = 2 * model.lam[:, None, None, None]
         weight = strength * model.coverage
-        pull = strength * model.patches.adjoint(E, z.shape) * (model.coverage > 0)
+        pull = weight * z - strength * model.patches.adjoint(R, z.shape)  # = 2 lam fold(D B), as fold(P) = coverage z
         if fields.anchor is not None and fields.anchor_weight is not None:
             weight, pull = weight + fields.anchor_weight, pull + fields.anchor_weight * fields.anchor
         if self.z_step == "exact":
@@ -267,30 +290,18 @@ class DLS(Integrator):
             z = (z - tau * slope + tau * pull) / (1 + tau * weight)
         return z
 
-    def _objective(self, model: _Model, z: Tensor, P: Tensor, D: Tensor, B: Tensor) -> Tensor:
+    def _objective(self, model: Model, state: State) -> Tensor:
         """(N,) value of the cost, for heights in pixels."""
-        fields = model.fields
-        cost = self.data_term.data_cost(fields, z)
+        fields, z = model.fields, state.z
+        cost = self.data_term.data_cost(fields, z) if model.edges is None else edge_cost(z, *model.edges, fields.steps)
         if fields.anchor is not None and fields.anchor_weight is not None:
             cost = cost + 0.5 * (fields.anchor_weight * (z - fields.anchor).square()).sum((-3, -2, -1))
-        return cost + model.lam * _patch_cost(P, D, B, model.mu, model.valid)
+        return cost + model.lam * patch_cost(state.R, state.B, model.mu, model.valid)
 
     def extra_repr(self) -> str:
         """The settings, as `print` shows them."""
         names = ("lam", "mu", "n_iter", "z_step", "order", "learn", "tol", "pixel_size")
         return f"{self.patches}, " + ", ".join(f"{n}={getattr(self, n)!r}" for n in names)
-
-
-class _Model(NamedTuple):
-    """The constants of one run: coverage (1 or N, 1, H, W) within the mask, valid pixels of the patches (N, n, L)."""
-
-    fields: Fields
-    patches: Patches
-    coverage: Tensor
-    valid: Tensor | None
-    noise: Tensor
-    lam: Tensor
-    mu: Tensor
 
 
 def dls_objective(
@@ -330,23 +341,13 @@ def dls_objective(
     fields = data.check(gradient, mask, weight)
     valid = None if fields.mask is None else patches.extract(fields.mask.to(height.dtype)) > 0
     mu = torch.as_tensor(mu, dtype=height.dtype, device=height.device).expand(height.shape[0])
-    return data.data_cost(fields, height) + lam * _patch_cost(patches.extract(height), dictionary, codes, mu, valid)
-
-
-def _patch_cost(P: Tensor, D: Tensor, B: Tensor, mu: Tensor, valid: Tensor | None) -> Tensor:
-    misfit = (P - D @ B).square()
-    fit = (misfit if valid is None else torch.where(valid, misfit, 0)).sum((1, 2))
-    return fit + penalty(B, mu[:, None, None]).sum((1, 2))
+    R = patches.extract(height) - dictionary @ codes
+    return data.data_cost(fields, height) + lam * patch_cost(R, codes, mu, valid)
 
 
 def _extend(z: Tensor, fields: Fields) -> Tensor:
     assert fields.mask is not None
     return harmonic_extension(z, fields.mask, pixel_size=fields.steps)
-
-
-def _choose(active: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """The new value where a surface is still active."""
-    return torch.where(active.view(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def _parameter(name: str, value: float | Tensor | str) -> float | Tensor | str:

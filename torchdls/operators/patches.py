@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
+
+from torchdls._tape import recorded
 
 
 @dataclass(frozen=True)
@@ -66,35 +68,55 @@ class Patches:
 
     def extract(self, z: Tensor) -> Tensor:
         """All patches: (N, 1, H, W) -> (N, n, L), L = rows * columns of `grid`."""
-        n = z.shape[0]
-        rows, columns = self.grid(z.shape)
-        pieces = [
-            [
-                F.unfold(z[..., r, c], self._size, stride=self._stride).unflatten(-1, (nr, nc))
-                for c, nc in self._spans(z, 1)
-            ]
-            for r, nr in self._spans(z, 0)
-        ]
-        strips = [torch.cat(p, -1) if len(p) > 1 else p[0] for p in pieces]
-        return (torch.cat(strips, -2) if len(strips) > 1 else strips[0]).reshape(n, self.n_pixels, rows * columns)
+        return self._gather(z) if torch.compiler.is_compiling() else _Extract.apply(z, self)
 
     def adjoint(self, x: Tensor, shape: Sequence[int]) -> Tensor:
         """Exact transpose, summing overlaps: (N, n, L) -> (N, 1, H, W), with (H, W) the last two of `shape`."""
-        h, w = shape[-2:]
-        x = x.unflatten(-1, self.grid(shape))
-        image: Tensor | None = None
-        row = 0
-        for r, nr in self._spans_of(h, 0):
-            column = 0
-            for c, nc in self._spans_of(w, 1):
-                block = x[:, :, row : row + nr, column : column + nc].flatten(-2)
-                part = F.fold(block, (r.stop - r.start, c.stop - c.start), self._size, stride=self._stride)
-                part = F.pad(part, (c.start, w - c.stop, r.start, h - r.stop))
-                image = part if image is None else image + part
-                column += nc
-            row += nr
-        assert image is not None
-        return image
+        size = (shape[-2], shape[-1])
+        return self._scatter(x, size) if torch.compiler.is_compiling() else _Adjoint.apply(x, self, size)
+
+    def extract_onto(self, x: Tensor, z: Tensor) -> Tensor:
+        """X + extract(z); where no derivative is recorded, x is overwritten and no copy of the patches is made."""
+        if recorded(x, z):
+            return x + self.extract(z)
+        self._gather(z, x)
+        return x
+
+    # Both maps go one axis at a time: pixel (i, j) of all patches is a strided slice of the image, taken from (or added
+    # to) a field that already holds column j of all patches.
+
+    def _gather(self, z: Tensor, onto: Tensor | None = None) -> Tensor:
+        (h, w), (rows, columns) = z.shape[-2:], self.grid(z.shape)
+        strips = z.new_empty(z.shape[0], self._size[1], h, columns)
+        for j, patches, pixels in self._slices(w, 1):
+            strips[:, j, :, patches].copy_(z[:, 0, :, pixels])
+        x = z.new_empty(z.shape[0], self.n_pixels, rows * columns) if onto is None else onto
+        grid = x.unflatten(-1, (rows, columns)).unflatten(1, self._size)
+        for i, patches, pixels in self._slices(h, 0):
+            part = grid[:, i, :, patches]
+            (part.copy_ if onto is None else part.add_)(strips[:, :, pixels])
+        return x
+
+    def _scatter(self, x: Tensor, size: tuple[int, int]) -> Tensor:
+        (h, w), (rows, columns) = size, self.grid(size)
+        grid = x.unflatten(-1, (rows, columns)).unflatten(1, self._size)
+        strips = x.new_zeros(x.shape[0], self._size[1], h, columns)
+        for i, patches, pixels in self._slices(h, 0):
+            strips[:, :, pixels].add_(grid[:, i, :, patches])
+        z = x.new_zeros(x.shape[0], 1, h, w)
+        for j, patches, pixels in self._slices(w, 1):
+            z[:, 0, :, pixels].add_(strips[:, j, :, patches])
+        return z
+
+    def _slices(self, m: int, axis: int) -> Iterator[tuple[int, slice, slice]]:
+        """For an axis of m pixels: (offset in the patch, patches, the pixel each of them has there)."""
+        first = 0
+        for pixels, count in self._spans_of(m, axis):
+            step = self._stride[axis]
+            for offset in range(self._size[axis]):
+                start = pixels.start + offset
+                yield offset, slice(first, first + count), slice(start, start + (count - 1) * step + 1, step)
+            first += count
 
     def coverage(self, shape: Sequence[int], *, dtype: torch.dtype, device: torch.device | str = "cpu") -> Tensor:
         """(1, 1, H, W): how many patches hold each pixel; the diagonal of sum_j P_j^T P_j."""
@@ -111,9 +133,6 @@ class Patches:
         held = (pixels >= starts[:, None]) & (pixels < starts[:, None] + size)
         return held.sum(0).to(dtype).to(device)
 
-    def _spans(self, z: Tensor, axis: int) -> list[tuple[slice, int]]:
-        return self._spans_of(z.shape[-2 + axis], axis)
-
     def _spans_of(self, m: int, axis: int) -> list[tuple[slice, int]]:
         """Pixels and patch count of the regular part of an axis and, where needed, of the extra patch at its end."""
         size, stride = self._size[axis], self._stride[axis]
@@ -121,6 +140,58 @@ class Patches:
         reach = (regular - 1) * stride + size
         spans = [(slice(0, reach), regular)]
         return spans if reach == m else [*spans, (slice(m - size, m), 1)]
+
+
+class _Extract(torch.autograd.Function):
+    """`Patches.extract`: linear, so its derivative is itself and its transpose is `_Adjoint`."""
+
+    @staticmethod
+    def forward(z: Tensor, patches: Patches) -> Tensor:
+        return patches._gather(z)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.patches, ctx.size = inputs[1], tuple(inputs[0].shape[-2:])
+
+    @staticmethod
+    def backward(ctx: Any, dx: Tensor) -> tuple[Tensor, None]:
+        return _Adjoint.apply(dx, ctx.patches, ctx.size), None
+
+    @staticmethod
+    def jvp(ctx: Any, dz: Tensor, *_: Any) -> Tensor:
+        return _Extract.apply(dz, ctx.patches)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], z: Tensor, patches: Patches) -> tuple[Tensor, int]:
+        z = z.movedim(in_dims[0] or 0, 0)
+        return _Extract.apply(z.flatten(0, 1), patches).unflatten(0, z.shape[:2]), 0
+
+
+class _Adjoint(torch.autograd.Function):
+    """`Patches.adjoint`: linear, so its derivative is itself and its transpose is `_Extract`."""
+
+    @staticmethod
+    def forward(x: Tensor, patches: Patches, size: tuple[int, int]) -> Tensor:
+        return patches._scatter(x, size)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.patches, ctx.size = inputs[1:]
+
+    @staticmethod
+    def backward(ctx: Any, dz: Tensor) -> tuple[Tensor, None, None]:
+        return _Extract.apply(dz, ctx.patches), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, dx: Tensor, *_: Any) -> Tensor:
+        return _Adjoint.apply(dx, ctx.patches, ctx.size)
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[int | None, ...], x: Tensor, patches: Patches, size: tuple[int, int]
+    ) -> tuple[Tensor, int]:
+        x = x.movedim(in_dims[0] or 0, 0)
+        return _Adjoint.apply(x.flatten(0, 1), patches, size).unflatten(0, x.shape[:2]), 0
 
 
 def _pair(name: str, value: int | Sequence[int]) -> tuple[int, int]:

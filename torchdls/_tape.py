@@ -1,0 +1,23 @@
+"""Whether an operation is being recorded, and so must not overwrite what it was given, nor look at its values."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def recorded(*tensors: Tensor) -> bool:
+    """True where autograd, a function transform or a compiler follows what happens to one of the tensors.
+
+    Where it is False nobody can tell results computed in place from fresh ones, and values may be looked at.
+    """
+    if torch.compiler.is_compiling() or torch.autograd.forward_ad._current_level >= 0:
+        return True
+    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
+        return True
+    return any(torch._C._functorch.is_functorch_wrapped_tensor(t) for t in tensors)
+
+
+def visible(x: Tensor) -> bool:
+    """Whether values can be looked at: not in a traced graph, nor inside vmap."""
+    return not (torch.compiler.is_compiling() or torch._C._functorch.is_batchedtensor(x))

@@ -1,0 +1,88 @@
+"""What DLS carries through its iterations, and how converged surfaces leave the batch."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchdls.dictionary.thresholds import total_penalty
+from torchdls.integrators.base import Fields
+from torchdls.operators import Patches
+
+
+class Model(NamedTuple):
+    """The constants of one run.
+
+    coverage (1 or N, 1, H, W) is counted within the mask; valid (N, n, L) marks the valid pixels of the patches; edges
+    are (v, w) where the data term keeps them, whatever the height.
+    """
+
+    fields: Fields
+    patches: Patches
+    coverage: Tensor
+    valid: Tensor | None
+    edges: tuple[Tensor, Tensor | None] | None
+    noise: Tensor
+    lam: Tensor
+    mu: Tensor
+
+    def part(self, keep: Tensor) -> Model:
+        """The model of some surfaces of the batch; what all share stays as it is."""
+        return Model(*(_select(value, keep) for value in self))
+
+
+class State(NamedTuple):
+    """Where the iterations stand: the first height, the present one, the residual R = P - D B of the patches, D, B."""
+
+    start: Tensor
+    z: Tensor
+    R: Tensor
+    D: Tensor
+    B: Tensor
+
+    def part(self, keep: Tensor) -> State:
+        """The state of some surfaces of the batch."""
+        return State(*(_select(value, keep) for value in self))
+
+    def choose(self, active: Tensor, new: State) -> State:
+        """The new state where a surface is still active."""
+        pairs = zip(self, new, strict=True)
+        return State(*(n if len(n) < len(active) else torch.where(_over(active, n), n, o) for o, n in pairs))
+
+
+class Part(NamedTuple):
+    """Surfaces of the batch that stopped at the same iteration, and where."""
+
+    surfaces: Tensor
+    state: State
+
+
+def _select(value: Any, keep: Tensor) -> Any:
+    """The surfaces where `keep` holds, in a tensor or in a tuple of them."""
+    if isinstance(value, Tensor):
+        return value[keep] if len(value) == len(keep) else value
+    if isinstance(value, Fields):
+        return Fields(*(_select(v, keep) for v in value))
+    return tuple(_select(v, keep) for v in value) if isinstance(value, tuple) else value
+
+
+def _over(active: Tensor, t: Tensor) -> Tensor:
+    return active.view(-1, *[1] * (t.ndim - 1))
+
+
+def merge(parts: list[Part]) -> State:
+    """All surfaces in the order in which they came."""
+    if len(parts) == 1:
+        return parts[0].state
+    order = torch.cat([p.surfaces for p in parts]).argsort()
+    columns = zip(*(p.state for p in parts), strict=True)
+    return State(*(torch.cat(c)[order] if sum(map(len, c)) == len(order) else c[0] for c in columns))
+
+
+def patch_cost(R: Tensor, B: Tensor, mu: Tensor, valid: Tensor | None) -> Tensor:
+    """(N,) fit and penalty of the patches; only the valid pixels of a patch count."""
+    R = R if valid is None else torch.where(valid, R, 0)
+    flat = R.flatten(1)
+    return torch.linalg.vecdot(flat, flat) + total_penalty(B, mu)
