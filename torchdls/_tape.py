@@ -19,5 +19,17 @@ def recorded(*tensors: Tensor) -> bool:
 
 
 def visible(x: Tensor) -> bool:
-    """Whether values can be looked at: not in a traced graph, nor inside vmap."""
-    return not (torch.compiler.is_compiling() or torch._C._functorch.is_batchedtensor(x))
+    """Whether values can be looked at: not in a traced graph, nor inside vmap, however deep."""
+    functorch = torch._C._functorch
+    if torch.compiler.is_compiling():
+        return False
+    while functorch.is_functorch_wrapped_tensor(x):
+        if functorch.is_batchedtensor(x):
+            return False
+        x = functorch.get_unwrapped(x)
+    return True
+
+
+def bool_all(condition: Tensor) -> bool:
+    """Whether a condition holds everywhere; True where values cannot be seen."""
+    return not visible(condition) or bool(condition.all())

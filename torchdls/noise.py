@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from torchdls._tape import bool_all
 from torchdls.operators import as_pixel_size, dst2, edge_slopes
 from torchdls.operators.sine import squared_sines
 from torchdls.operators.tables import table
@@ -104,7 +105,7 @@ def _normalised(curl: Tensor, w: Tensor, dx: float, dy: float) -> tuple[Tensor, 
     x, y = w[:, 0, :, :-1], w[:, 1, :-1]
     edges = torch.stack([x[:, :-1], x[:, 1:], y[:, :, 1:], y[:, :, :-1]], 1)
     cells = (edges > 0).all(1)
-    if not (torch.compiler.is_compiling() or cells.flatten(1).any(1).all()):
+    if not bool_all(cells.flatten(1).any(1)):
         raise ValueError("noise_level: a mask (or the positive weights) holds no complete cell of 2 x 2 pixels")
     halves = 0.5 / torch.where(cells[:, None], edges, 1)
     variance = dx * dx * halves[:, :2].sum(1) + dy * dy * halves[:, 2:].sum(1)
@@ -163,14 +164,12 @@ def _check(gradient: Tensor, mask: Tensor | None, weight: Tensor | None) -> None
         _check_fit("mask", mask, shape, (1,))
     if weight is not None:
         _check_fit("weight", weight, shape, (1, 2))
-    if torch.compiler.is_compiling():
-        return  # the checks below look at values
     inside = gradient if mask is None else torch.where(mask, gradient, 0)
-    if not inside.isfinite().all():
+    if not bool_all(inside.isfinite()):
         raise ValueError(
             "noise_level: gradient holds NaN or infinite values" + (" inside the mask" if mask is not None else "")
         )
-    if weight is not None and not (weight.isfinite() & (weight >= 0)).all():
+    if weight is not None and not bool_all(weight.isfinite() & (weight >= 0)):
         raise ValueError("noise_level: weight holds negative, NaN or infinite values")
 
 

@@ -215,8 +215,10 @@ def _times_sparse(R: Tensor, b: Tensor, look: bool) -> Tensor:
 
 
 def _normalize(h: Tensor) -> Tensor:
-    """h / ||h|| for each surface, 0 where h = 0; safe in the derivative too."""
-    return h / torch.linalg.vector_norm(h, dim=1, keepdim=True).clamp(min=torch.finfo(h.dtype).tiny)
+    """h / ||h|| for each surface, 0 where h = 0; safe in the first and second derivative, as the norm itself is not."""
+    square = h.square().sum(1, keepdim=True)
+    some = square > 0
+    return torch.where(some, h, 0) * torch.where(some, square, 1).rsqrt()
 
 
 def _where_used(atoms: Tensor, D: Tensor, unused: Unused) -> Tensor:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchdls._tape import visible
+from torchdls._tape import bool_all
 from torchdls.operators import GradientOperator, as_pixel_size, edge_slopes
 
 
@@ -157,11 +157,6 @@ def edge_cost(z: Tensor, v: Tensor, w: Tensor | None, steps: tuple[float, float]
     """(N,) 1/2 sum w (A z - v)^2."""
     misfit = (GradientOperator("forward", steps)(z) - v).square()
     return 0.5 * (misfit if w is None else w * misfit).sum((-3, -2, -1))
-
-
-def bool_all(condition: Tensor) -> bool:
-    """Whether a condition holds everywhere; True where values cannot be seen (in a traced graph, inside vmap)."""
-    return not visible(condition) or bool(condition.all())
 
 
 def _require(holds: bool, message: str) -> None:

@@ -223,7 +223,7 @@ class DLS(Integrator):
             R = model.patches.extract(z)
         else:
             some = model.valid.any(1, keepdim=True)
-            R = torch.where(some, model.patches.extract(_extend(z, model.fields)), 0)
+            R = torch.where(some, model.patches.extract(_extend(z, model.fields, self.z_tol)), 0)
         return State(z, z, R, D, R.new_zeros(R.shape[0], D.shape[-1], R.shape[-1]))
 
     def _iterate(self, model: Model, state: State) -> State:
@@ -248,7 +248,7 @@ class DLS(Integrator):
         """Everything that stays the same during the iterations."""
         gradient, mask = fields.gradient, fields.mask
         shape, N = gradient.shape[-2:], gradient.shape[0]
-        noise = noise_level(gradient.detach(), mask)
+        noise = noise_level(gradient, mask)
         lam = _per_surface("lam", self.lam, _AUTO_LAM * torch.ones_like(noise))
         mu = _per_surface("mu", self.mu, _AUTO_MU * noise)
         coverage = self.patches.coverage(shape, dtype=gradient.dtype, device=gradient.device)
@@ -282,7 +282,7 @@ class DLS(Integrator):
             anchor = pull / torch.where(weight > 0, weight, 1)
             return solve(v, w, anchor, weight, tol=self.z_tol, z0=z.detach(), pixel_size=fields.steps).height
         a = GradientOperator("forward", fields.steps)
-        largest = z.new_ones(()) if w is None else w.detach().amax((-3, -2, -1), keepdim=True).clamp(min=1)
+        largest = z.new_ones(()) if w is None else w.amax((-3, -2, -1), keepdim=True).clamp(min=1)
         tau = 1 / (a.norm_bound**2 * largest)
         for _ in range(self.n_prox):
             misfit = a(z) - v
@@ -345,9 +345,9 @@ def dls_objective(
     return data.data_cost(fields, height) + lam * patch_cost(R, codes, mu, valid)
 
 
-def _extend(z: Tensor, fields: Fields) -> Tensor:
+def _extend(z: Tensor, fields: Fields, tol: float) -> Tensor:
     assert fields.mask is not None
-    return harmonic_extension(z, fields.mask, pixel_size=fields.steps)
+    return harmonic_extension(z, fields.mask, tol=tol, pixel_size=fields.steps)
 
 
 def _parameter(name: str, value: float | Tensor | str) -> float | Tensor | str:

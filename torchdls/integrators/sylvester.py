@@ -9,7 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchdls.integrators.base import Fields, Integrator, _fit, bool_all
+from torchdls._tape import bool_all
+from torchdls.integrators.base import Fields, Integrator, _fit
 from torchdls.operators.local_polynomials import (
     build_derivative,
     cosine_basis,
