@@ -25,7 +25,7 @@ BENCH_TESTS := $(wildcard benchmarks/bench_*.py benchmarks/test_*.py)
 BENCH_SCRIPTS := $(filter-out $(BENCH_TESTS) benchmarks/conftest.py benchmarks/_%,$(wildcard benchmarks/*.py))
 NOTEBOOKS := $(patsubst notebooks/%.py,%,$(wildcard notebooks/*.py))
 
-.PHONY: help demo test lint format types notebooks notebooks-update bench-smoke check clean
+.PHONY: help demo test lint format types notebooks notebooks-update picture bench-smoke check clean
 .DELETE_ON_ERROR:
 
 help:
@@ -57,6 +57,11 @@ notebooks: $(VENV)/.dev
 # Runs them and keeps the result beside the source.
 notebooks-update: notebooks
 	@for name in $(NOTEBOOKS); do cp $(SCRATCH)/notebooks/$$name.ipynb notebooks/$$name.ipynb; done
+
+# The README's picture, from the demo's.
+picture: demo
+	$(BIN)/python -c "from PIL import Image; p = Image.open('$(DEMO)/terrain.png').convert('RGB'); \
+	p.resize((900, p.height * 900 // p.width), Image.Resampling.LANCZOS).quantize(256).save('docs/demo.png', optimize=True)"
 
 bench-smoke: $(VENV)/.dev
 	$(if $(BENCH_TESTS),$(BIN)/python -m pytest --benchmark-disable --quiet $(BENCH_TESTS))

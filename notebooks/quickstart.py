@@ -26,7 +26,7 @@ import torch
 
 import torchdls
 
-surface = torchdls.SURFACES["peaks"](128)  # height (1, 1, H, W) and exact gradient (1, 2, H, W)
+surface = torchdls.SURFACES["peaks"](96)  # height (1, 1, H, W) and exact gradient (1, 2, H, W)
 
 # %% [markdown]
 # ## The pictures
