@@ -72,7 +72,7 @@ def soup_dil_sweep(
     """
     _check(P, D, B, order, unused, threshold)
     _check_levels(mu, bound, B)
-    R = P - D @ B
+    R = (P.mT - B.mT @ D.mT).mT
     B = B if recorded(R, D, B) else B.clone()
     _, D, B = residual_sweep(R, D, B, mu, bound, order, unused=unused, learn=learn, threshold=threshold)
     return D, B
@@ -91,6 +91,8 @@ def residual_sweep(
     threshold: Threshold = "hard",
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`soup_dil_sweep` for a caller who keeps the residual R = P - D B (N, n, L) instead of the patches.
+
+    It is fastest where each patch of R is contiguous, as `Patches.extract` has it.
 
     Returns:
         R, D and B after the sweep. Where no derivative is recorded, R and B are overwritten: no second copy is made.
@@ -184,8 +186,6 @@ def _update_atoms(H: Tensor, C: Tensor, D: Tensor, rule: _Rule) -> Tensor:
 def _atom_order(R: Tensor, D: Tensor, B: Tensor, rule: _Rule) -> tuple[Tensor, Tensor, Tensor]:
     """Row, atom, row, atom, ..: the residual R is brought up to date once per group, rows within the group exactly."""
     shared = D.shape[0] < R.shape[0]
-    if rule.in_place:
-        R = R.mT.contiguous().mT  # patch by patch: the patches that use an atom are gathered in whole cache lines
     groups, atoms = [], []
     for start in range(0, D.shape[-1], _GROUP):
         D0, B0 = D[..., start : start + _GROUP], B[:, start : start + _GROUP]

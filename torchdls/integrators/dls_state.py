@@ -84,5 +84,5 @@ def merge(parts: list[Part]) -> State:
 def patch_cost(R: Tensor, B: Tensor, mu: Tensor, valid: Tensor | None) -> Tensor:
     """(N,) fit and penalty of the patches; only the valid pixels of a patch count."""
     R = R if valid is None else torch.where(valid, R, 0)
-    flat = R.flatten(1)
+    flat = R.mT.flatten(1)  # as it lies in memory
     return torch.linalg.vecdot(flat, flat) + total_penalty(B, mu)

@@ -67,7 +67,7 @@ class Patches:
         return rows, columns
 
     def extract(self, z: Tensor) -> Tensor:
-        """All patches: (N, 1, H, W) -> (N, n, L), L = rows * columns of `grid`."""
+        """All patches: (N, 1, H, W) -> (N, n, L), L = rows * columns of `grid`; each patch is contiguous in memory."""
         return self._gather(z) if torch.compiler.is_compiling() else _Extract.apply(z, self)
 
     def adjoint(self, x: Tensor, shape: Sequence[int]) -> Tensor:
@@ -82,41 +82,54 @@ class Patches:
         self._gather(z, x)
         return x
 
-    # Both maps go one axis at a time: pixel (i, j) of all patches is a strided slice of the image, taken from (or added
-    # to) a field that already holds column j of all patches.
+    # Patches lie in memory one after the other, so that a column of the (n, L) matrix is contiguous: products with few
+    # atoms stream through them, and the patches that use an atom can be gathered.
 
     def _gather(self, z: Tensor, onto: Tensor | None = None) -> Tensor:
-        (h, w), (rows, columns) = z.shape[-2:], self.grid(z.shape)
-        strips = z.new_empty(z.shape[0], self._size[1], h, columns)
-        for j, patches, pixels in self._slices(w, 1):
-            strips[:, j, :, patches].copy_(z[:, 0, :, pixels])
-        x = z.new_empty(z.shape[0], self.n_pixels, rows * columns) if onto is None else onto
-        grid = x.unflatten(-1, (rows, columns)).unflatten(1, self._size)
-        for i, patches, pixels in self._slices(h, 0):
-            part = grid[:, i, :, patches]
-            (part.copy_ if onto is None else part.add_)(strips[:, :, pixels])
+        rows, columns = self.grid(z.shape)
+        x = z.new_empty(z.shape[0], rows * columns, self.n_pixels).mT if onto is None else onto
+        grid = x.mT.unflatten(1, (rows, columns)).unflatten(3, self._size)
+        for patches, pixels in self._blocks(z.shape):
+            windows = z[:, 0, *pixels]
+            for axis in (0, 1):
+                windows = windows.unfold(1 + axis, self._size[axis], self._stride[axis])
+            part = grid[:, *patches]
+            (part.copy_ if onto is None else part.add_)(windows)
         return x
 
     def _scatter(self, x: Tensor, size: tuple[int, int]) -> Tensor:
-        (h, w), (rows, columns) = size, self.grid(size)
-        grid = x.unflatten(-1, (rows, columns)).unflatten(1, self._size)
-        strips = x.new_zeros(x.shape[0], self._size[1], h, columns)
-        for i, patches, pixels in self._slices(h, 0):
-            strips[:, :, pixels].add_(grid[:, i, :, patches])
-        z = x.new_zeros(x.shape[0], 1, h, w)
-        for j, patches, pixels in self._slices(w, 1):
-            z[:, 0, :, pixels].add_(strips[:, j, :, patches])
+        grid = x.mT.unflatten(1, self.grid(size)).unflatten(3, self._size)
+        z = x.new_zeros(x.shape[0], 1, *size)
+        for patches, pixels in self._blocks(size):
+            z[:, 0, *pixels].add_(self._fold(grid[:, *patches]))
         return z
 
-    def _slices(self, m: int, axis: int) -> Iterator[tuple[int, slice, slice]]:
-        """For an axis of m pixels: (offset in the patch, patches, the pixel each of them has there)."""
-        first = 0
-        for pixels, count in self._spans_of(m, axis):
-            step = self._stride[axis]
-            for offset in range(self._size[axis]):
-                start = pixels.start + offset
-                yield offset, slice(first, first + count), slice(start, start + (count - 1) * step + 1, step)
-            first += count
+    def _fold(self, x: Tensor) -> Tensor:
+        """(N, rows, columns, c_y, c_x) regular patches -> (N, h, w), one axis after the other.
+
+        The image is cut into bands of s_y rows: s_y rows of all patches at once go into the bands below. Then pixel j
+        of all patches is a strided slice of the image.
+        """
+        (rows, columns), (c_y, c_x), (s_y, s_x) = x.shape[1:3], self._size, self._stride
+        strips = x.new_zeros(x.shape[0], rows + (c_y - 1) // s_y, columns, s_y, c_x)
+        for band, top in enumerate(range(0, c_y, s_y)):
+            part = x[:, :, :, top : top + s_y]
+            strips[:, band : band + rows, :, : part.shape[3]].add_(part)
+        h, w = (rows - 1) * s_y + c_y, (columns - 1) * s_x + c_x
+        bands = x.new_zeros(x.shape[0], strips.shape[1], s_y, w)
+        for j in range(c_x):
+            bands[..., j : j + (columns - 1) * s_x + 1 : s_x].add_(strips[..., j].mT)
+        return bands.flatten(1, 2)[:, :h]
+
+    def _blocks(self, shape: Sequence[int]) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
+        """Patches on a regular grid, and the pixels they cover: one block, or up to four where there are extra ones."""
+        top = 0
+        for down, rows in self._spans_of(shape[-2], 0):
+            left = 0
+            for across, columns in self._spans_of(shape[-1], 1):
+                yield (slice(top, top + rows), slice(left, left + columns)), (down, across)
+                left += columns
+            top += rows
 
     def coverage(self, shape: Sequence[int], *, dtype: torch.dtype, device: torch.device | str = "cpu") -> Tensor:
         """(1, 1, H, W): how many patches hold each pixel; the diagonal of sum_j P_j^T P_j."""
