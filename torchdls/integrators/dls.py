@@ -15,6 +15,7 @@ from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
 from torchdls.integrators.base import Fields, Integrator, edge_cost
 from torchdls.integrators.dls_state import Model, Part, State, merge, patch_cost
 from torchdls.integrators.least_squares import LeastSquares
+from torchdls.integrators.window import live_window
 from torchdls.noise import noise_level
 from torchdls.operators import GradientOperator, Patches
 from torchdls.solvers import harmonic_extension, solve
@@ -188,7 +189,16 @@ class DLS(Integrator):
         return result._replace(height=result.height * self.unit, codes=result.codes * self.unit)
 
     def _run(self, fields: Fields, callback: Callback | None) -> DLSResult:
-        model = self._model(fields)
+        """The iterations, within the window of the patches that a mask leaves alive."""
+        noise = noise_level(fields.gradient, fields.mask)
+        window = live_window(fields.mask, self.patches)
+        if window is None:
+            return self._run_within(fields, noise, callback)
+        result = self._run_within(window.crop(fields), noise, callback)
+        return result._replace(height=window.put_back(result.height), codes=window.put_codes_back(result.codes))
+
+    def _run_within(self, fields: Fields, noise: Tensor, callback: Callback | None) -> DLSResult:
+        model = self._model(fields, noise)
         state = self._start(model)
         objective = [self._objective(model, state)]
         active = torch.ones_like(model.noise, dtype=torch.bool)
@@ -223,8 +233,16 @@ class DLS(Integrator):
             R = model.patches.extract(z)
         else:
             some = model.valid.any(1, keepdim=True)
-            R = torch.where(some, model.patches.extract(_extend(z, model.fields, self.z_tol)), 0)
+            R = torch.where(some, model.patches.extract(self._extend(model, z)), 0)
         return State(z, z, R, D, R.new_zeros(R.shape[0], D.shape[-1], R.shape[-1]))
+
+    def _extend(self, model: Model, z: Tensor) -> Tensor:
+        """The height continued over the patches that hold a valid pixel."""
+        assert model.fields.mask is not None
+        assert model.valid is not None
+        live = model.valid.any(1, keepdim=True).expand(model.valid.shape).to(z.dtype)
+        reach = model.patches.adjoint(live, z.shape) > 0
+        return harmonic_extension(z, model.fields.mask, reach, tol=self.z_tol, pixel_size=model.fields.steps)
 
     def _iterate(self, model: Model, state: State) -> State:
         """One round: codes and atoms, then the height."""
@@ -244,11 +262,10 @@ class DLS(Integrator):
         settled = step <= self.tol * way
         return settled.all().expand_as(settled) if self.learn == "shared" else settled
 
-    def _model(self, fields: Fields) -> Model:
+    def _model(self, fields: Fields, noise: Tensor) -> Model:
         """Everything that stays the same during the iterations."""
         gradient, mask = fields.gradient, fields.mask
         shape, N = gradient.shape[-2:], gradient.shape[0]
-        noise = noise_level(gradient, mask)
         lam = _per_surface("lam", self.lam, _AUTO_LAM * torch.ones_like(noise))
         mu = _per_surface("mu", self.mu, _AUTO_MU * noise)
         coverage = self.patches.coverage(shape, dtype=gradient.dtype, device=gradient.device)
@@ -343,11 +360,6 @@ def dls_objective(
     mu = torch.as_tensor(mu, dtype=height.dtype, device=height.device).expand(height.shape[0])
     R = patches.extract(height) - dictionary @ codes
     return data.data_cost(fields, height) + lam * patch_cost(R, codes, mu, valid)
-
-
-def _extend(z: Tensor, fields: Fields, tol: float) -> Tensor:
-    assert fields.mask is not None
-    return harmonic_extension(z, fields.mask, tol=tol, pixel_size=fields.steps)
 
 
 def _parameter(name: str, value: float | Tensor | str) -> float | Tensor | str:

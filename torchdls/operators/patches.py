@@ -66,6 +66,18 @@ class Patches:
         rows, columns = ((m - p + s - 1) // s + 1 for m, p, s in zip((h, w), self._size, self._stride, strict=True))
         return rows, columns
 
+    def touching(self, axis: int, length: int, low: int, high: int) -> tuple[slice, slice]:
+        """Pixels and numbers of the patches that hold a pixel from `low` to `high`, along an axis of `length` pixels.
+
+        Cut to these pixels, the axis has just these patches, in the same places.
+        """
+        size, stride = self._size[axis], self._stride[axis]
+        last_start = length - size  # of the last patch, flush with the border
+        count = -(-last_start // stride) + 1
+        first = min(max(0, -(-(low - size + 1) // stride)), count - 1)
+        last = count - 1 if high >= last_start else high // stride
+        return slice(min(first * stride, last_start), min(last * stride, last_start) + size), slice(first, last + 1)
+
     def extract(self, z: Tensor) -> Tensor:
         """All patches: (N, 1, H, W) -> (N, n, L), L = rows * columns of `grid`; each patch is contiguous in memory."""
         return self._gather(z) if torch.compiler.is_compiling() else _Extract.apply(z, self)
