@@ -166,6 +166,8 @@ def _bar(label: str, method: Integrator, quiet: bool) -> Iterator[Any]:
         def step(iteration: int, objective: Tensor) -> None:
             bar.set_postfix_str(f"objective {float(objective.sum()):.6g}", refresh=False)
             bar.update(iteration - bar.n)
+            if iteration == steps:
+                bar.refresh()  # the last step shows, however quick
 
         yield step
 
