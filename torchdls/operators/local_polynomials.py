@@ -48,10 +48,9 @@ def build_derivative(n: int, support: int, degree: int, step: float) -> Tensor:
     fit = torch.linalg.pinv(torch.stack([t**k for k in range(degree + 1)], 1))  # samples -> coefficients
     powers = [k * t ** (k - 1) if k else torch.zeros_like(t) for k in range(degree + 1)]
     taps = torch.stack(powers, 1) @ fit / step  # row i: the derivative at sample i of the window
-    for i in range(n):
-        start = min(max(i - (support - 1) // 2, 0), n - support)
-        D[i, start : start + support] = taps[i - start]
-    return D
+    i = torch.arange(n, device="cpu")
+    start = (i - (support - 1) // 2).clamp(0, n - support)
+    return D.scatter(1, start[:, None] + torch.arange(support, device="cpu"), taps[i - start])
 
 
 _derivative = table(build_derivative)
