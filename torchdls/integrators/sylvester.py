@@ -52,21 +52,21 @@ class GlobalLeastSquares(Integrator):
         self.support = support
         self.degree = support - 1 if degree is None else degree
 
-    def modes_of(self, n: int, step: float, axis: str, like: Tensor) -> Modes:
-        """The eigenvectors of an axis ("rows" or "columns") of n pixels; what a subclass may choose."""
-        return axis_modes(n, step, self.support, self.degree, "cosine", n, 0.0, 1, like=like)
+    def modes_of(self, n: int, step: float, dim: int, like: Tensor) -> Modes:
+        """The eigenvectors of the rows (dim -2) or columns (dim -1), n of them; what a subclass may choose."""
+        return axis_modes(n, step, dim, self.support, self.degree, "cosine", n, 0.0, 1, like=like)
 
     def integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
         gx, gy = fields.gradient.split(1, -3)
         h, w = gx.shape[-2:]
         dx, dy = fields.steps
-        rows = self.modes_of(h, dy, "rows", gx)
-        columns = self.modes_of(w, dx, "columns", gx)
-        right = columns.project(rows.project_slopes(gy).mT).mT + rows.project(columns.project_slopes(gx.mT).mT)
+        rows = self.modes_of(h, dy, -2, gx)
+        columns = self.modes_of(w, dx, -1, gx)
+        right = columns.project(rows.project_slopes(gy)) + rows.project(columns.project_slopes(gx))
         total = rows.eigenvalues[:, None] + columns.eigenvalues
-        coefficients = torch.where(total > 0, right / torch.where(total > 0, total, 1), 0)
-        return rows.expand(columns.expand(coefficients.mT).mT)
+        coefficients = right / total.masked_fill(total == 0, torch.inf)
+        return rows.expand(columns.expand(coefficients))
 
 
 class HarkerOLeary(GlobalLeastSquares):
@@ -148,15 +148,14 @@ class SpectralRegularization(GlobalLeastSquares):
         self.modes = pair
         self.basis = basis
 
-    def modes_of(self, n: int, step: float, axis: str, like: Tensor) -> Modes:
+    def modes_of(self, n: int, step: float, dim: int, like: Tensor) -> Modes:
         """The eigenvectors of an axis of n pixels within the span of its first modes."""
-        asked = self.modes[axis == "columns"]
+        asked = self.modes[2 + dim]
         count = asked if isinstance(asked, int) else max(1, round(asked * n))
         if count > n:
-            raise ValueError(
-                f"SpectralRegularization: modes={asked} given for {n} {axis}, at most as many are possible"
-            )
-        return axis_modes(n, step, self.support, self.degree, self.basis, count, 0.0, 1, like=like)
+            sides = f"{n} {('rows', 'columns')[2 + dim]}"
+            raise ValueError(f"SpectralRegularization: modes={asked} given for {sides}, at most as many are possible")
+        return axis_modes(n, step, dim, self.support, self.degree, self.basis, count, 0.0, 1, like=like)
 
     def extra_repr(self) -> str:
         """The settings, as `print` shows them."""
@@ -206,9 +205,9 @@ class TikhonovRegularization(GlobalLeastSquares):
         self.lam = float(lam)
         self.order = order
 
-    def modes_of(self, n: int, step: float, axis: str, like: Tensor) -> Modes:
+    def modes_of(self, n: int, step: float, dim: int, like: Tensor) -> Modes:
         """The eigenvectors of D^T D + lam S^T S."""
-        return axis_modes(n, step, self.support, self.degree, "cosine", n, self.lam, self.order, like=like)
+        return axis_modes(n, step, dim, self.support, self.degree, "cosine", n, self.lam, self.order, like=like)
 
     def forward(
         self,
@@ -265,58 +264,73 @@ class TikhonovRegularization(GlobalLeastSquares):
 
 
 class Modes(NamedTuple):
-    """Eigenvectors of one axis of n pixels: first the even ones, then the odd ones, each by its first half of rows.
+    """Eigenvectors of the rows or the columns: first the even ones, then the odd ones, each by its first half.
 
     Attributes:
         vectors: (ceil(n / 2), k), the upper half of U.
         slopes: (ceil(n / 2), k), the upper half of D U, odd where U is even and even where it is odd.
         eigenvalues: (k,), at least 0.
-        n: pixels of the axis.
+        n: rows or columns of the image.
+        dim: -2 for rows, -1 for columns: the dimension that the maps below act on.
     """
 
     vectors: Tensor
     slopes: Tensor
     eigenvalues: Tensor
     n: int
+    dim: int
 
     def project(self, x: Tensor) -> Tensor:
-        """U^T x: (.., n, m) -> (.., k, m)."""
-        even, odd = self._fold(x)
-        return _apply(self.vectors.mT, even, odd)
+        """U^T x: n pixels -> k coefficients."""
+        return self._apply(self.vectors.mT, *self._fold(x))
 
     def project_slopes(self, x: Tensor) -> Tensor:
-        """(D U)^T x: (.., n, m) -> (.., k, m)."""
+        """(D U)^T x: n pixels -> k coefficients."""
         even, odd = self._fold(x)
-        return _apply(self.slopes.mT, odd, even)
+        return self._apply(self.slopes.mT, odd, even)
 
     def expand(self, c: Tensor) -> Tensor:
-        """U c: (.., k, m) -> (.., n, m)."""
-        count = (c.shape[-2] + 1) // 2
-        even = self.vectors[:, :count] @ c[..., :count, :]
-        odd = self.vectors[:, count:] @ c[..., count:, :]
-        return torch.cat([even + odd, (even - odd)[..., : self.n // 2, :].flip(-2)], -2)
+        """U c: k coefficients -> n pixels."""
+        count = (c.shape[self.dim] + 1) // 2
+        even = self._multiply(self.vectors[:, :count], c.narrow(self.dim, 0, count))
+        odd = self._multiply(self.vectors[:, count:], c.narrow(self.dim, count, c.shape[self.dim] - count))
+        return torch.cat([even + odd, (even - odd).narrow(self.dim, 0, self.n // 2).flip(self.dim)], self.dim)
 
     def _fold(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Sum and difference of the upper half and the mirrored lower half; the middle row counts once."""
+        """Sum and difference of the first half and the mirrored second half; a middle pixel counts once."""
         half = self.vectors.shape[0]
-        upper, lower = x[..., :half, :], x[..., half:, :].flip(-2)
-        lower = F.pad(lower, (0, 0, 0, self.n % 2))
-        return upper + lower, upper - lower
+        first, second = x.narrow(self.dim, 0, half), x.narrow(self.dim, half, self.n - half).flip(self.dim)
+        if self.n % 2:
+            second = F.pad(second, (0, 1) if self.dim == -1 else (0, 0, 0, 1))
+        return first + second, first - second
 
+    def _apply(self, transposed: Tensor, first: Tensor, second: Tensor) -> Tensor:
+        """The even modes' rows of a matrix times one field, the odd modes' times the other."""
+        count = (transposed.shape[0] + 1) // 2
+        parts = self._multiply(transposed[:count], first), self._multiply(transposed[count:], second)
+        return torch.cat(parts, self.dim)
 
-def _apply(transposed: Tensor, first: Tensor, second: Tensor) -> Tensor:
-    """The first half of the rows (of the modes) times one field, the others times the other."""
-    count = (transposed.shape[0] + 1) // 2
-    return torch.cat([transposed[:count] @ first, transposed[count:] @ second], -2)
+    def _multiply(self, matrix: Tensor, x: Tensor) -> Tensor:
+        return matrix @ x if self.dim == -2 else x @ matrix.mT
 
 
 def axis_modes(
-    n: int, step: float, support: int, degree: int, basis: Basis, count: int, lam: float, order: int, *, like: Tensor
+    n: int,
+    step: float,
+    dim: int,
+    support: int,
+    degree: int,
+    basis: Basis,
+    count: int,
+    lam: float,
+    order: int,
+    *,
+    like: Tensor,
 ) -> Modes:
     """Eigenvectors of D^T D + lam (D^order)^T D^order in the span of the first `count` vectors of a basis."""
     packed = _packed_modes(n, step, support, degree, basis, count, lam, order, like=like)
     half = (n + 1) // 2
-    return Modes(packed[:half], packed[half : 2 * half], packed[-1], n)
+    return Modes(packed[:half], packed[half : 2 * half], packed[-1], n, dim)
 
 
 def _build_modes(
