@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchdls.integrators.base import Fields, Integrator
 from torchdls.integrators.dirichlet import solve_dirichlet
-from torchdls.solvers import SolveResult, solve
+from torchdls.operators import slope_divergence
+from torchdls.solvers import SolveResult, direct_result, solve
 
 
 class LeastSquares(Integrator):
@@ -64,6 +65,8 @@ class LeastSquares(Integrator):
         """The solve and how it went, from a warm start z0."""
         if self.boundary == "dirichlet":
             return solve_dirichlet(fields, tol=self.tol, max_iter=self.max_iter, z0=z0)
+        if fields.mask is None and fields.weight is None and fields.anchor is None:
+            return direct_result(slope_divergence(fields.gradient, fields.steps), None, fields.steps)
         v, w = self.edges(fields)
         return solve(
             v,

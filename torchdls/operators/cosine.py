@@ -10,7 +10,7 @@ from torch import Tensor
 from torchdls.operators.tables import table
 
 # Up to this side two products with the cosine matrix beat the FFT and its reordering passes (measured on a CPU).
-_MATRIX_LIMIT = 64
+MATRIX_LIMIT = 64
 
 
 def dct2(x: Tensor) -> Tensor:
@@ -30,9 +30,9 @@ def dct2(x: Tensor) -> Tensor:
     Source: Makhoul, "A fast cosine transform in one and two dimensions", IEEE TASSP 28(1), 1980.
     """
     h, w = x.shape[-2:]
-    if max(h, w) <= _MATRIX_LIMIT:
+    if max(h, w) <= MATRIX_LIMIT:
         return _cosine_matrix(h, like=x) @ x @ _cosine_matrix(w, like=x).mT
-    spectrum = torch.fft.rfft2(_even_then_odd(_even_then_odd(x, -1), -2))
+    spectrum = torch.fft.rfft2(_reordered(x))
     p = spectrum * _twiddle(h, w, like=x)
     q = _negate_rows(spectrum).conj() * _twiddle_conj(h, w, like=x)
     head, tail = (p + q).real, (q - p).imag
@@ -49,7 +49,7 @@ def idct2(x: Tensor) -> Tensor:
         (..., H, W), in the dtype and on the device of `x`.
     """
     h, w = x.shape[-2:]
-    if max(h, w) <= _MATRIX_LIMIT:
+    if max(h, w) <= MATRIX_LIMIT:
         return _cosine_matrix(h, like=x).mT @ x @ _cosine_matrix(w, like=x)
     # The spectrum of the reordered image, from sums C without their scale, and C[H, .] = C[., W] = 0:
     # V[k, l] = conj(a_k b_l) ((C[k, l] - C[H-k, W-l]) - i (C[H-k, l] + C[k, W-l])).
@@ -57,7 +57,31 @@ def idct2(x: Tensor) -> Tensor:
     tail = torch.nn.functional.pad(x[..., w - w // 2 :].flip(-1), (1, 0))
     spectrum = torch.complex(head - _reverse_rows(tail), -(_reverse_rows(head) + tail))
     y = torch.fft.irfft2(spectrum * _inverse_twiddle(h, w, like=x), s=(h, w))
-    return _interleave(_interleave(y, -2), -1)
+    return _restored(y)
+
+
+def half_spectrum(x: Tensor) -> Tensor:
+    """U (.., H, W//2 + 1): one FFT that holds the cosine sums C of x, four to a number.
+
+        U[k, l] = (C[k, l] - C[H-k, W-l]) - i (C[H-k, l] + C[k, W-l]),     C[H, .] = C[., W] = 0
+
+    with C[k, l] = sum_ij x[i, j] cos(pi k (2 i + 1) / 2H) cos(pi l (2 j + 1) / 2W). A linear map that is diagonal in C
+    need not unpack it. x (.., H, W) is not written to.
+    """
+    h, w = x.shape[-2:]
+    return torch.fft.rfft2(_reordered(x)).mul_(_rotation(h, w, like=x))
+
+
+def from_half_spectrum(spectrum: Tensor, size: tuple[int, int]) -> Tensor:
+    """Inverse of `half_spectrum`; overwrites its argument."""
+    h, w = size
+    y = torch.fft.irfft2(spectrum.mul_(_rotation_back(h, w, like=spectrum.real)), s=size)
+    return _restored(y)
+
+
+def mirrored(values: Tensor) -> Tensor:
+    """For U as real numbers (.., H, M, 2): row H - k in row k, for k = 1 .. H - 1, real and imaginary part swapped."""
+    return values[..., 1:, :, :].flip((-3, -1))
 
 
 def neumann_eigenvalues(shape: tuple[int, int], like: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
@@ -98,6 +122,16 @@ def _phase(n: int, count: int) -> Tensor:
 
 
 @table
+def _rotation(h: int, w: int) -> Tensor:
+    return _phase(h, h)[:, None] * _phase(w, w // 2 + 1)
+
+
+@table
+def _rotation_back(h: int, w: int) -> Tensor:
+    return (_phase(h, h)[:, None] * _phase(w, w // 2 + 1)).conj().resolve_conj()
+
+
+@table
 def _twiddle(h: int, w: int) -> Tensor:
     scale = _scale(h)[:, None] * _scale(w)[: w // 2 + 1] / 2
     return scale * _phase(h, h)[:, None] * _phase(w, w // 2 + 1)
@@ -115,19 +149,22 @@ def _inverse_twiddle(h: int, w: int) -> Tensor:
     return (_phase(h, h)[:, None] * _phase(w, w // 2 + 1)).conj() / weight
 
 
-def _even_then_odd(x: Tensor, dim: int) -> Tensor:
-    """x0 x2 x4 .. x5 x3 x1: the order in which an FFT of the same length gives the DCT."""
-    even, odd = (x[..., ::2], x[..., 1::2]) if dim == -1 else (x[..., ::2, :], x[..., 1::2, :])
-    return torch.cat([even, odd.flip(dim)], dim)
+def _reordered(x: Tensor) -> Tensor:
+    """Along both dimensions x0 x2 x4 .. x5 x3 x1: the order in which an FFT of the same length gives the DCT."""
+    (h, w), y = x.shape[-2:], torch.empty_like(x, memory_format=torch.contiguous_format)
+    for rows, i in (slice(0, (h + 1) // 2), 0), (slice((h + 1) // 2, h), 1):
+        for columns, j in (slice(0, (w + 1) // 2), 0), (slice((w + 1) // 2, w), 1):
+            y[..., rows, columns] = x[..., i::2, j::2].flip([d for d, odd in ((-2, i), (-1, j)) if odd])
+    return y
 
 
-def _interleave(y: Tensor, dim: int) -> Tensor:
-    """Inverse of `_even_then_odd`."""
-    n = y.shape[dim]
-    pairs = n // 2
-    even, last, odd = y.split([pairs, n % 2, pairs], dim)
-    mixed = torch.stack([even, odd.flip(dim)], dim).flatten(dim - 1, dim)
-    return torch.cat([mixed, last], dim) if n % 2 else mixed
+def _restored(y: Tensor) -> Tensor:
+    """Inverse of `_reordered`."""
+    (h, w), x = y.shape[-2:], torch.empty_like(y)
+    for rows, i in (slice(0, (h + 1) // 2), 0), (slice((h + 1) // 2, h), 1):
+        for columns, j in (slice(0, (w + 1) // 2), 0), (slice((w + 1) // 2, w), 1):
+            x[..., i::2, j::2] = y[..., rows, columns].flip([d for d, odd in ((-2, i), (-1, j)) if odd])
+    return x
 
 
 def _negate_rows(v: Tensor) -> Tensor:

@@ -228,6 +228,23 @@ def edge_slopes(
     return v, both * 0.5
 
 
+def slope_divergence(gradient: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
+    """A^T v (N, 1, H, W) for forward differences A and the slopes v = `edge_slopes(gradient)` of equal trust.
+
+    Averaging and differencing make one central difference, once the slopes are continued with opposite sign:
+
+        (A^T v)_j = (g_{j-1} - g_{j+1}) / 2 dx + (the same along y),     g_{-1} = -g_0,  g_W = -g_{W-1}
+    """
+    (gx, gy), (dx, dy) = gradient.split(1, -3), pixel_size
+    return torch.add(_central(gx, -1) * (0.5 / dx), _central(gy, -2), alpha=0.5 / dy)
+
+
+def _central(g: Tensor, dim: int) -> Tensor:
+    n = g.shape[dim]
+    g = torch.cat([-g.narrow(dim, 0, 1), g, -g.narrow(dim, n - 1, 1)], dim)
+    return g.narrow(dim, 0, n) - g.narrow(dim, 2, n)
+
+
 def _stack_edges(x: Tensor, y: Tensor) -> Tensor:
     """Edges along the rows (.., H, W - 1) and along the columns (.., H - 1, W), padded to one (.., 2, H, W) field."""
     return torch.cat([F.pad(x, (0, 1)), F.pad(y, (0, 0, 0, 1))], -3)

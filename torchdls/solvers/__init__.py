@@ -2,14 +2,16 @@
 
 from torchdls.solvers.cg import conjugate_gradients
 from torchdls.solvers.components import connected_components
+from torchdls.solvers.direct import solve_direct
 from torchdls.solvers.extension import harmonic_extension
-from torchdls.solvers.poisson import ConvergenceWarning, SolveResult, solve, solve_direct
+from torchdls.solvers.poisson import ConvergenceWarning, SolveResult, direct_result, solve
 
 __all__ = [
     "ConvergenceWarning",
     "SolveResult",
     "conjugate_gradients",
     "connected_components",
+    "direct_result",
     "harmonic_extension",
     "solve",
     "solve_direct",

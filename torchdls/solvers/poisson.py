@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchdls.operators import GradientOperator, as_pixel_size, dct2, idct2, neumann_eigenvalues
+from torchdls.operators import GradientOperator, as_pixel_size
 from torchdls.solvers.cg import LinearMap, conjugate_gradients
 from torchdls.solvers.components import Gauge, free_constants
+from torchdls.solvers.direct import direct_map, solve_direct
 
 # From this ratio of anchor to edge weight on, the diagonal is the cheaper preconditioner (measured on a CPU).
 _FIRM = 0.25
@@ -97,26 +98,17 @@ def solve(
     if r is not None and anchor is not None:
         b = b + r * anchor
     if w is None and (r is None or r[0].numel() == 1):
-        z = solve_direct(b, r, setting.pixel_size)
-        zeros = torch.zeros(z.shape[0], dtype=z.dtype, device=z.device)
-        return SolveResult(z, zeros.long(), zeros, zeros == 0)
+        return direct_result(b, r, setting.pixel_size)
     w = _present_edges(v) if w is None else w.expand_as(v)
     r = torch.zeros_like(b) if r is None else r.expand_as(b)
     return SolveResult(*_Solve.apply(b, w, r, z0, None, None, setting)[:4])
 
 
-def solve_direct(b: Tensor, r: Tensor | float | None, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
-    """(A^T A + r)^{-1} b by cosine transforms, r one number per surface (N, 1, 1, 1); zero mean where r = 0.
-
-    Args:
-        b: (N, 1, H, W).
-        r: (N, 1, 1, 1), a number, or None for 0.
-        pixel_size: (dx, dy).
-    """
-    eigenvalues = neumann_eigenvalues((b.shape[-2], b.shape[-1]), b, pixel_size)
-    shifted = eigenvalues if r is None else eigenvalues + r
-    singular = shifted == 0
-    return idct2(torch.where(singular, 0, dct2(b) / torch.where(singular, 1, shifted)))
+def direct_result(b: Tensor, r: Tensor | None, pixel_size: tuple[float, float]) -> SolveResult:
+    """`solve_direct` as a result of `solve`."""
+    z = solve_direct(b, r, pixel_size)
+    zeros = torch.zeros(z.shape[0], dtype=z.dtype, device=z.device)
+    return SolveResult(z, zeros.long(), zeros, zeros == 0)
 
 
 def _A(setting: _Setting) -> GradientOperator:
@@ -282,7 +274,8 @@ def _preconditioner(w: Tensor, r: Tensor, setting: _Setting) -> LinearMap:
         diagonal = edge_ends(w / scale.square()) + r
         return lambda b: b / torch.where(alive, diagonal, 1)
     s = torch.where(alive, ((k + rho) / total).sqrt(), 0)
-    return lambda b: s * solve_direct(s * b, rho, setting.pixel_size)
+    inverse = direct_map((w.shape[-2], w.shape[-1]), rho, setting.pixel_size, w)
+    return lambda b: s * inverse(s * b)
 
 
 def edge_ends(w: Tensor) -> Tensor:

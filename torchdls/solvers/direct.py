@@ -1,0 +1,133 @@
+"""The direct solve: shifted Poisson equations on a rectangle, diagonal in the cosine basis."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdls._tape import visible
+from torchdls.operators import dct2, idct2, neumann_eigenvalues
+from torchdls.operators.cosine import MATRIX_LIMIT, from_half_spectrum, half_spectrum, mirrored
+from torchdls.operators.tables import table
+from torchdls.solvers.cg import LinearMap
+
+
+def solve_direct(b: Tensor, r: Tensor | float | None, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
+    """(A^T A + r)^{-1} b by cosine transforms, r one number per surface (N, 1, 1, 1); zero mean where r = 0.
+
+    The map is symmetric: its derivative in b is itself, and with lambda = (A^T A + r)^{-1} dL/dz, dL/dr = -<lambda, z>.
+
+    Args:
+        b: (N, 1, H, W).
+        r: (N, 1, 1, 1), a number, or None for 0.
+        pixel_size: (dx, dy).
+    """
+    r = torch.as_tensor(r, dtype=b.dtype, device=b.device) if isinstance(r, int | float) else r
+    if torch.compiler.is_compiling():
+        return direct_map((b.shape[-2], b.shape[-1]), r, pixel_size, b)(b)
+    return _Direct.apply(b, r, pixel_size)
+
+
+def direct_map(size: tuple[int, int], r: Tensor | None, pixel_size: tuple[float, float], like: Tensor) -> LinearMap:
+    """The map b -> (A^T A + r)^{-1} b for repeated use: its gains are computed once."""
+    if max(size) <= MATRIX_LIMIT:
+        eigenvalues = neumann_eigenvalues(size, like, pixel_size)
+        gain = _inverse(eigenvalues if r is None else eigenvalues + r)
+        return lambda b: idct2(dct2(b) * gain)
+    own, other = _tables(size, r, pixel_size, like)
+
+    def apply(b: Tensor) -> Tensor:
+        spectrum = half_spectrum(b)
+        values = torch.view_as_real(spectrum)
+        opposite = mirrored(values)
+        values.mul_(own)[..., 1:, :, :].addcmul_(opposite, other, value=-1)
+        return from_half_spectrum(spectrum, size)
+
+    return apply
+
+
+def _inverse(eigenvalues: Tensor) -> Tensor:
+    singular = eigenvalues == 0
+    return torch.where(singular, 0, 1 / torch.where(singular, 1, eigenvalues))
+
+
+def _tables(
+    size: tuple[int, int], r: Tensor | None, pixel_size: tuple[float, float], like: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Gains of the half spectrum: what U[k, l] keeps, and what U[H - k, l] passes to it.
+
+    U mixes four cosine coefficients C (see `half_spectrum`), whose eigenvalues differ. With f the inverse eigenvalue of
+    C[k, l], f' of C[H-k, W-l], g of C[H-k, l], g' of C[k, W-l], multiplying every coefficient by its own gives
+
+        Re U <- (f + f')/2 Re U - (f - f')/2 Im U~        Im U <- (g + g')/2 Im U - (g - g')/2 Re U~
+
+    with U~ the same column in row H - k; in row 0 there is none and Re U <- f Re U, Im U <- g' Im U.
+    """
+    if r is None or (visible(r) and not bool(r.any())):
+        return _own(*size, *pixel_size, like=like), _other(*size, *pixel_size, like=like)
+    return _gains(size, pixel_size, r.to(like))
+
+
+@table
+def _own(h: int, w: int, dx: float, dy: float) -> Tensor:
+    return _gains((h, w), (dx, dy), torch.zeros(1, 1, 1, dtype=torch.float64, device="cpu"))[0][0]
+
+
+@table
+def _other(h: int, w: int, dx: float, dy: float) -> Tensor:
+    return _gains((h, w), (dx, dy), torch.zeros(1, 1, 1, dtype=torch.float64, device="cpu"))[1][0]
+
+
+def _gains(size: tuple[int, int], pixel_size: tuple[float, float], r: Tensor) -> tuple[Tensor, Tensor]:
+    (h, w), (dx, dy) = size, pixel_size
+    y = neumann_eigenvalues((h, 1), r, (1.0, dy))
+    x = neumann_eigenvalues((1, w), r, (dx, 1.0))[:, : w // 2 + 1]
+    y_mirror, x_mirror = 4 / dy**2 - y, 4 / dx**2 - x
+    f, f_mirror, g, g_mirror = (
+        _inverse(a + b + r) for a, b in ((y, x), (y_mirror, x_mirror), (y_mirror, x), (y, x_mirror))
+    )
+    own = torch.stack([f + f_mirror, g + g_mirror], -1) / 2
+    own[..., 0, :, :] = torch.stack([f[..., 0, :], g_mirror[..., 0, :]], -1)
+    other = torch.stack([f - f_mirror, g - g_mirror], -1)[..., 1:, :, :] / 2
+    return own, other
+
+
+class _Direct(torch.autograd.Function):
+    """z = (A^T A + r)^+ b, symmetric in b."""
+
+    @staticmethod
+    def forward(b: Tensor, r: Tensor | None, pixel_size: tuple[float, float]) -> Tensor:
+        return direct_map((b.shape[-2], b.shape[-1]), r, pixel_size, b)(b)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        _, r, ctx.pixel_size = inputs
+        saved = (None, None) if r is None else (r, output)
+        ctx.save_for_backward(*saved)
+        ctx.save_for_forward(*saved)
+
+    @staticmethod
+    def backward(ctx: Any, dz: Tensor) -> tuple[Tensor | None, ...]:
+        r, z = ctx.saved_tensors
+        adjoint = _Direct.apply(dz, r, ctx.pixel_size)
+        dr = -(adjoint * z).sum_to_size(r.shape) if ctx.needs_input_grad[1] else None
+        return adjoint, dr, None
+
+    @staticmethod
+    def jvp(ctx: Any, db: Tensor | None, dr: Tensor | None, *_: Any) -> Tensor:
+        r, z = ctx.saved_tensors
+        change = db if dr is None else -dr * z if db is None else db - dr * z
+        return _Direct.apply(change, r, ctx.pixel_size)
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[int | None, ...], b: Tensor, r: Tensor | None, pixel_size: tuple[float, float]
+    ) -> tuple[Tensor, int]:
+        size = info.batch_size
+        b = b.expand(size, *b.shape) if in_dims[0] is None else b.movedim(in_dims[0], 0)
+        if r is not None:
+            r = r.expand(size, *r.shape) if in_dims[1] is None else r.movedim(in_dims[1], 0)
+            r = r.reshape(size, -1, 1, 1, 1).expand(size, b.shape[1], 1, 1, 1).flatten(0, 1)
+        return _Direct.apply(b.flatten(0, 1), r, pixel_size).unflatten(0, (size, -1)), 0
