@@ -13,7 +13,7 @@ from torch import Tensor
 
 import torchdls
 from tests.helpers import random_field
-from torchdls import DLS, INTEGRATORS, HornBrooks, Integrator, LeastSquares
+from torchdls import DLS, INTEGRATORS, HornBrooks, Integrator, LeastSquares, SlopeDLS
 
 H, W = 6, 7  # a rectangle, neither side a multiple of the stride of DLS
 
@@ -21,6 +21,11 @@ H, W = 6, 7  # a rectangle, neither side a multiple of the stride of DLS
 def dls(**options: Any) -> Callable[[], Integrator]:
     settings = {"patch_size": 3, "n_atoms": 9, "lam": 0.4, "mu": 0.35, "n_iter": 2, "tol": 0.0, "z_tol": 1e-13}
     return lambda: DLS(data_term=LeastSquares(tol=1e-13), **{**settings, **options})
+
+
+def slope_dls(**options: Any) -> Callable[[], Integrator]:
+    settings: dict[str, Any] = {"patch_sizes": (3, 5), "tau": 0.8, "n_iter": 2, "z_tol": 1e-13}
+    return lambda: SlopeDLS(**(settings | options))
 
 
 # What each method is built with: nothing, unless it stands here. More than one line tests more than one form.
@@ -36,6 +41,10 @@ VARIANTS: dict[str, dict[str, Callable[[], Integrator]]] = {
         "shared": dls(learn="shared", pixel_size=(0.5, 1.5)),
         "proximal": dls(z_step="proximal", n_prox=2),
         "fixed": dls(learn="fixed"),
+    },
+    "slope_dls": {
+        "default": slope_dls(),
+        "cosines": slope_dls(learn=False, aggregate="sparsity", pixel_size=(0.5, 1.5)),
     },
 }
 # Iterations that stop when a value says so, written in plain operations: vmap refuses them, and says why.

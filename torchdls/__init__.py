@@ -30,6 +30,8 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.integrators import Integrator as Integrator
     from torchdls.integrators import LeastSquares as LeastSquares
     from torchdls.integrators import LineIntegral as LineIntegral
+    from torchdls.integrators import SlopeDLS as SlopeDLS
+    from torchdls.integrators import SlopeDLSResult as SlopeDLSResult
     from torchdls.integrators import SpectralRegularization as SpectralRegularization
     from torchdls.integrators import TikhonovRegularization as TikhonovRegularization
     from torchdls.integrators import dls_objective as dls_objective
@@ -75,6 +77,8 @@ _MODULE_OF = {
     "HarkerOLeary": "integrators",
     "HornBrooks": "integrators",
     "LineIntegral": "integrators",
+    "SlopeDLS": "integrators",
+    "SlopeDLSResult": "integrators",
     "SpectralRegularization": "integrators",
     "TikhonovRegularization": "integrators",
     "dls_objective": "integrators",

@@ -57,5 +57,6 @@ INTEGRATORS = Registry(
         "spectral_regularization": "SpectralRegularization",
         "tikhonov_regularization": "TikhonovRegularization",
         "dls": "DLS",
+        "slope_dls": "SlopeDLS",
     }
 )

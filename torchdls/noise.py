@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchdls._tape import bool_all
 from torchdls.operators import as_pixel_size, dst2, edge_slopes
+from torchdls.operators.cosine import cosine_matrix
 from torchdls.operators.sine import squared_sines
 from torchdls.operators.tables import table
 
@@ -177,3 +178,116 @@ def _check_fit(what: str, tensor: Tensor, shape: tuple[int, ...], channels: tupl
     fits = tensor.ndim == 4 and tensor.shape[0] in (1, shape[0]) and tensor.shape[1] in channels
     if not fits or tensor.shape[2:] != shape[2:]:
         raise ValueError(f"noise_level: {what} {tuple(tensor.shape)} does not fit gradient {shape}")
+
+
+# --- what least squares makes of white noise --------------------------------------------------------------------------
+
+_PERIOD = 128  # side of the periodic grid on which the spectrum of the projected noise is sampled
+
+
+def height_noise(shape: tuple[int, int], like: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
+    r"""Variance of the cosine coefficients of a least-squares height, for white noise of variance 1 in the gradient.
+
+        S_kl = (a_x c_x + a_y c_y) / (a_x + a_y)^2,   S_00 = 0
+        a_x = 4 sin^2(w_x / 2) / dx^2,   c_x = cos^2(w_x / 2),   w_x = pi l / W,   and alike in y
+
+    c is what averaging the slopes of two neighbours leaves of their noise, 1 / a what integration makes of it. The
+    coefficients (of `dct2`) are exactly uncorrelated on a rectangle with equal trust in all slopes.
+
+    Args:
+        shape: (H, W).
+        like: a tensor of the wanted dtype and device.
+        pixel_size: (dx, dy).
+
+    Returns:
+        (H, W).
+    """
+    return _height_noise(tuple(shape), tuple(pixel_size), like=like)
+
+
+@table
+def _height_noise(shape: tuple[int, int], pixel_size: tuple[float, float]) -> Tensor:
+    h, w = shape
+    y, x = (
+        torch.sin(torch.arange(n, dtype=torch.float64, device="cpu") * (math.pi / (2 * n))).square() for n in (h, w)
+    )
+    a_y, a_x = 4 * y[:, None] / pixel_size[1] ** 2, 4 * x / pixel_size[0] ** 2
+    total = a_x + a_y
+    total[0, 0] = 1
+    return (a_x * (1 - x) + a_y * (1 - y)[:, None]) / total.square()
+
+
+def cosine_noise(size: tuple[int, int], like: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
+    r"""Standard deviation of the cosine coefficients of a patch of projected slopes, for white noise of level 1.
+
+    The slopes A z of the least-squares height carry the part of the noise that is a gradient. Its spectrum (far from
+    the border) is that of `slope_covariance`, and with the discrete-time Fourier transform of an atom d
+
+        std^2 = mean over w of S_xx(w) |d(w)|^2   (S_yy for the slopes in y)
+
+    Args:
+        size: (rows, columns) of a patch.
+        like: a tensor of the wanted dtype and device.
+        pixel_size: (dx, dy).
+
+    Returns:
+        (2, rows, columns): for dz/dx and dz/dy, coefficients in the order of `dct2`.
+    """
+    return _cosine_noise(tuple(size), tuple(pixel_size), like=like)
+
+
+@table
+def _cosine_noise(size: tuple[int, int], pixel_size: tuple[float, float]) -> Tensor:
+    n = _spectrum_side(size)
+    xx, yy, _ = _projected_spectra(n, pixel_size)
+    down, across = (torch.fft.fft(cosine_matrix(k, like=xx), n).abs().square() for k in size)
+    return torch.stack([(down @ s @ across.mT).sqrt() / n for s in (xx, yy)])
+
+
+def slope_covariance(size: tuple[int, int], like: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
+    r"""Covariance of the projected noise in a patch of slopes (x above y), for white noise of level 1.
+
+    The inverse Fourier transforms of
+
+        S_xx = a_x q,   S_yy = a_y q,   S_xy = g_x conj(g_y) q,   q = (a_x c_x + a_y c_y) / (a_x + a_y)^2
+
+    with g_x = (exp(i w_x) - 1) / dx, a_x = |g_x|^2, c_x = cos^2(w_x / 2), alike in y, and S_xx(0) = S_yy(0) = 1/2 (the
+    mean over all directions).
+
+    Args:
+        size: (rows, columns) of a patch, n pixels.
+        like: a tensor of the wanted dtype and device.
+        pixel_size: (dx, dy).
+
+    Returns:
+        (2n, 2n).
+    """
+    return _slope_covariance(tuple(size), tuple(pixel_size), like=like)
+
+
+@table
+def _slope_covariance(size: tuple[int, int], pixel_size: tuple[float, float]) -> Tensor:
+    n = _spectrum_side(size)
+    i, j = (t.flatten() for t in torch.meshgrid(*(torch.arange(k, device="cpu") for k in size), indexing="ij"))
+    lag = (i[:, None] - i) % n, (j[:, None] - j) % n
+    xx, yy, xy = (torch.fft.ifft2(s).real[lag] for s in _projected_spectra(n, pixel_size))
+    return torch.cat([torch.cat([xx, xy], 1), torch.cat([xy.mT, yy], 1)])
+
+
+def _spectrum_side(size: tuple[int, int]) -> int:
+    """Side of the periodic grid: at least twice the patch, so that no lag wraps around."""
+    return max(_PERIOD, 2 * max(size))
+
+
+def _projected_spectra(n: int, pixel_size: tuple[float, float]) -> tuple[Tensor, Tensor, Tensor]:
+    """S_xx, S_yy (real) and S_xy (complex) on an n x n grid of frequencies, rows first."""
+    w = torch.arange(n, dtype=torch.float64, device="cpu") * (2 * math.pi / n)
+    difference, c = torch.polar(torch.ones_like(w), w) - 1, torch.cos(w / 2).square()
+    g_x, g_y = (difference / pixel_size[0]).expand(n, n), (difference / pixel_size[1])[:, None].expand(n, n)
+    a_x, a_y = g_x.abs().square(), g_y.abs().square()
+    total = a_x + a_y
+    total[0, 0] = 1
+    q = (a_x * c + a_y * c[:, None]) / total.square()
+    xx, yy = a_x * q, a_y * q
+    xx[0, 0] = yy[0, 0] = 0.5
+    return xx, yy, g_x * g_y.conj() * q

@@ -7,6 +7,7 @@ from torchdls.integrators.fourier import FrankotChellappa
 from torchdls.integrators.horn_brooks import HornBrooks
 from torchdls.integrators.least_squares import LeastSquares
 from torchdls.integrators.line_integral import LineIntegral
+from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
 from torchdls.integrators.sylvester import HarkerOLeary, SpectralRegularization, TikhonovRegularization
 
 __all__ = [
@@ -20,6 +21,8 @@ __all__ = [
     "Integrator",
     "LeastSquares",
     "LineIntegral",
+    "SlopeDLS",
+    "SlopeDLSResult",
     "SpectralRegularization",
     "TikhonovRegularization",
     "dls_objective",

@@ -31,7 +31,7 @@ def dct2(x: Tensor) -> Tensor:
     """
     h, w = x.shape[-2:]
     if max(h, w) <= MATRIX_LIMIT:
-        return _cosine_matrix(h, like=x) @ x @ _cosine_matrix(w, like=x).mT
+        return cosine_matrix(h, like=x) @ x @ cosine_matrix(w, like=x).mT
     spectrum = torch.fft.rfft2(_reordered(x))
     p = spectrum * _twiddle(h, w, like=x)
     q = _negate_rows(spectrum).conj() * _twiddle_conj(h, w, like=x)
@@ -50,7 +50,7 @@ def idct2(x: Tensor) -> Tensor:
     """
     h, w = x.shape[-2:]
     if max(h, w) <= MATRIX_LIMIT:
-        return _cosine_matrix(h, like=x).mT @ x @ _cosine_matrix(w, like=x)
+        return cosine_matrix(h, like=x).mT @ x @ cosine_matrix(w, like=x)
     # The spectrum of the reordered image, from sums C without their scale, and C[H, .] = C[., W] = 0:
     # V[k, l] = conj(a_k b_l) ((C[k, l] - C[H-k, W-l]) - i (C[H-k, l] + C[k, W-l])).
     head = x[..., : w // 2 + 1]
@@ -102,7 +102,7 @@ def _eigenvalues(h: int, w: int, dx: float, dy: float) -> Tensor:
 
 
 @table
-def _cosine_matrix(n: int) -> Tensor:
+def cosine_matrix(n: int) -> Tensor:
     """(n, n) orthonormal DCT-II matrix: row k is c_k cos(pi k (2 i + 1) / 2n)."""
     k = torch.arange(n, device="cpu")
     angle = (k[:, None] * (2 * k + 1)) % (4 * n)  # exact integers: no accuracy lost to a large argument of the cosine
