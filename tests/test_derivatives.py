@@ -33,6 +33,7 @@ VARIANTS: dict[str, dict[str, Callable[[], Integrator]]] = {
     "least_squares": {
         "default": lambda: LeastSquares(tol=1e-13),
         "pixel_size": lambda: LeastSquares(tol=1e-13, pixel_size=(0.5, 2.0)),
+        "dirichlet": lambda: LeastSquares(tol=1e-13, boundary="dirichlet"),
     },
     "horn_brooks": {"default": lambda: HornBrooks(relaxation=1.5)},
     "dls": {
