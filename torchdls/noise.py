@@ -139,7 +139,7 @@ def _robust_scale(x: Tensor, valid: Tensor | None = None) -> Tensor:
     limit = _CUT * candidates.flatten(1).nanmedian(1).values / _NORMAL_MEDIAN
     kept = candidates <= limit[:, None, None]
     norm = torch.linalg.vector_norm(torch.where(kept, x, 0), dim=(-2, -1))  # derivative 0, not NaN, at 0
-    return norm / (_TRIMMED_VARIANCE * kept.sum((-2, -1))).sqrt()
+    return norm / (_TRIMMED_VARIANCE * kept.sum((-2, -1), dtype=x.dtype)).sqrt()
 
 
 @table

@@ -12,13 +12,15 @@ from torch import Tensor, nn
 from torchdls._tape import visible
 from torchdls.dictionary import dct_dictionary
 from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
+from torchdls.dictionary.thresholds import penalty
 from torchdls.integrators.base import Fields, Integrator, edge_cost
+from torchdls.integrators.dls_checks import check_dictionary, check_size, parameter, per_surface
 from torchdls.integrators.dls_state import Model, Part, State, merge, patch_cost
 from torchdls.integrators.least_squares import LeastSquares
 from torchdls.integrators.window import live_window
 from torchdls.noise import noise_level
 from torchdls.operators import GradientOperator, Patches
-from torchdls.solvers import harmonic_extension, solve
+from torchdls.solvers import harmonic_extension, remove_free_constants, solve
 
 # lam is a plateau from here on; one standard deviation of the noise is safe on textured relief and on smooth surfaces
 # alike (benchmarks/quality.py).
@@ -35,8 +37,9 @@ class DLSResult(NamedTuple):
         height: (N, 1, H, W).
         dictionary: (N, n, K), or (1, n, K) if shared or fixed; unit-norm atoms.
         codes: (N, K, L), in units of height.
-        objective: (N, n_iter + 1), from the start (B = 0) on, for heights in pixels.
-        noise: (N,) estimated standard deviation of one gradient sample.
+        objective: (N, n_iter + 1), from the start (B = 0) on, for heights in pixels and before their free constant is
+            taken out; it never rises (with one dictionary for the batch, its sum over the batch never does).
+        noise: (N,) estimated standard deviation of one gradient sample, of mean weight if there are weights.
         lam: (N,) the regularisation weight used.
         mu: (N,) the threshold used, for heights in pixels.
         converged: (N,) bool, whether the height settled to `tol` before the iterations ran out.
@@ -65,9 +68,9 @@ class DLS(Integrator):
     `lam` and `mu` refer to heights measured in pixels (h = sqrt(dx dy)), so they mean the same at every pixel size.
 
     With a mask, the fit counts valid pixels only. Invalid pixels of a patch are filled before each sweep by the patch's
-    current approximation D b_j, which majorises that cost, so the objective still never rises; before the first
-    sweep, by the harmonic extension of the height. Patches without a valid pixel are left out. Nothing outside the
-    mask is read.
+    current approximation D b_j, which majorises that cost; before the first sweep, by the harmonic extension of the
+    height, and patches that this serves badly lose their codes again. So the objective never rises. Patches without a
+    valid pixel are left out. Nothing outside the mask is read.
 
     Args:
         patch_size: rows and columns of a patch, or one number for both.
@@ -146,13 +149,13 @@ class DLS(Integrator):
                 raise ValueError(f"DLS: {name}={number!r} given, an integer of at least {least} is needed")
         if not bound > 0 or not tol >= 0 or not z_tol > 0:
             raise ValueError(f"DLS: bound={bound!r} and z_tol={z_tol!r} must be positive, tol={tol!r} not negative")
-        self.lam = _parameter("lam", lam)
-        self.mu = _parameter("mu", mu)
+        self.lam = parameter("lam", lam)
+        self.mu = parameter("mu", mu)
         self.n_iter, self.n_sweeps, self.n_prox = n_iter, n_sweeps, n_prox
         self.z_step, self.order, self.learn, self.unused = z_step, order, learn, unused
         self.bound, self.tol, self.z_tol = bound, tol, z_tol
         initial = dct_dictionary(self.patches.size, n_atoms) if dictionary is None else dictionary
-        _check_dictionary(initial, self.patches)
+        check_dictionary(initial, self.patches)
         if isinstance(initial, nn.Parameter):
             self.dictionary = initial
         else:
@@ -190,7 +193,8 @@ class DLS(Integrator):
 
     def _run(self, fields: Fields, callback: Callback | None) -> DLSResult:
         """The iterations, within the window of the patches that a mask leaves alive."""
-        noise = noise_level(fields.gradient, fields.mask)
+        check_size(fields.gradient, self.patches)
+        noise = self._noise(fields)
         window = live_window(fields.mask, self.patches)
         if window is None:
             return self._run_within(fields, noise, callback)
@@ -206,7 +210,7 @@ class DLS(Integrator):
         look = self.tol > 0 and visible(fields.gradient)
         for iteration in range(1, self.n_iter + 1):
             index, old = parts[-1]
-            new = self._iterate(running, old)
+            new = self._iterate(running, old, first=iteration == 1)
             settled = self._settled(new, old)
             if not look:  # every surface stays in the batch, and those that have settled do not move
                 new = old.choose(active, new) if self.tol > 0 else new
@@ -223,7 +227,8 @@ class DLS(Integrator):
                 running = running.part(~settled)
         objective += [objective[-1]] * (self.n_iter + 1 - len(objective))
         end = merge(parts)
-        return DLSResult(end.z, end.D, end.B, torch.stack(objective, 1), model.noise, model.lam, model.mu, ~active)
+        z = remove_free_constants(end.z, fields.mask, fields.anchor_weight)
+        return DLSResult(z, end.D, end.B, torch.stack(objective, 1), model.noise, model.lam, model.mu, ~active)
 
     def _start(self, model: Model) -> State:
         """Heights of the data term alone, and no codes: the patches are the residual."""
@@ -244,15 +249,19 @@ class DLS(Integrator):
         reach = model.patches.adjoint(live, z.shape) > 0
         return harmonic_extension(z, model.fields.mask, reach, tol=self.z_tol, pixel_size=model.fields.steps)
 
-    def _iterate(self, model: Model, state: State) -> State:
+    def _iterate(self, model: Model, state: State, first: bool) -> State:
         """One round: codes and atoms, then the height."""
         R, D, B = state.R, state.D, state.B
+        bare = torch.where(model.valid, R, 0) if first and model.valid is not None else None
         for _ in range(self.n_sweeps):
             R, D, B = residual_sweep(
                 R, D, B, model.mu[:, None], self.bound, self.order, unused=self.unused, learn=self.learn != "fixed"
             )
             # Filling the invalid pixels of a patch by its approximation D b means: no residual there.
             R = R if model.valid is None else torch.where(model.valid, R, 0)
+            if bare is not None:
+                R, B = _worthwhile(bare, R, B, model.mu)
+                bare = None
         z = self._step(model, state.z, R)
         return State(state.start, z, model.patches.extract_onto(R, z - state.z), D, B)
 
@@ -266,8 +275,8 @@ class DLS(Integrator):
         """Everything that stays the same during the iterations."""
         gradient, mask = fields.gradient, fields.mask
         shape, N = gradient.shape[-2:], gradient.shape[0]
-        lam = _per_surface("lam", self.lam, _AUTO_LAM * torch.ones_like(noise))
-        mu = _per_surface("mu", self.mu, _AUTO_MU * noise)
+        lam = per_surface("lam", self.lam, _AUTO_LAM * torch.ones_like(noise))
+        mu = per_surface("mu", self.mu, _AUTO_MU * noise)
         coverage = self.patches.coverage(shape, dtype=gradient.dtype, device=gradient.device)
         kind = type(self.data_term)
         settled = kind.edges is Integrator.edges and kind.data_cost is Integrator.data_cost
@@ -276,6 +285,19 @@ class DLS(Integrator):
             return Model(fields, self.patches, coverage, None, edges, noise, lam, mu)
         valid = self.patches.extract(mask.to(gradient.dtype)) > 0
         return Model(fields, self.patches, coverage * mask, valid.expand(N, -1, -1), edges, noise, lam, mu)
+
+    def _noise(self, fields: Fields) -> Tensor:
+        """(N,) noise of a gradient sample of mean weight; NaN where it cannot be told and mu does not need it."""
+        weight = fields.weight
+        if weight is not None:  # a common factor of the weights is no news about the noise
+            count = (weight > 0).sum((-3, -2, -1), keepdim=True).clamp(min=1)
+            weight = weight * count / weight.sum((-3, -2, -1), keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
+        try:
+            return noise_level(fields.gradient, fields.mask, weight, fields.steps)
+        except ValueError as error:
+            if isinstance(self.mu, str):
+                raise ValueError(f"DLS: mu='auto' finds no noise level, give a number ({error})") from error
+            return fields.gradient.new_full((len(fields.gradient),), math.nan)
 
     def _initial_dictionary(self, fields: Fields) -> Tensor:
         D = self.dictionary.to(fields.gradient)
@@ -362,29 +384,11 @@ def dls_objective(
     return data.data_cost(fields, height) + lam * patch_cost(R, codes, mu, valid)
 
 
-def _parameter(name: str, value: float | Tensor | str) -> float | Tensor | str:
-    """Lam or mu: "auto", a number or a tensor, neither negative nor NaN."""
-    known = value == "auto" if isinstance(value, str) else bool((torch.as_tensor(value) >= 0).all())
-    if not known:
-        raise ValueError(f"DLS: {name}={value!r} given, 'auto' or a number of at least 0 is needed")
-    return value
+def _worthwhile(bare: Tensor, R: Tensor, B: Tensor, mu: Tensor) -> tuple[Tensor, Tensor]:
+    """Residual and codes after the first sweep; patches that are better off without codes keep their bare residual.
 
-
-def _per_surface(name: str, value: float | Tensor | str, auto: Tensor) -> Tensor:
-    if isinstance(value, str):
-        return auto
-    value = torch.as_tensor(value, dtype=auto.dtype, device=auto.device)
-    if value.numel() not in (1, auto.numel()):
-        raise ValueError(f"DLS: {name} {tuple(value.shape)} does not fit {auto.numel()} surfaces")
-    return value.reshape(-1).expand(auto.shape)
-
-
-def _check_dictionary(dictionary: Tensor, patches: Patches) -> None:
-    if not isinstance(dictionary, Tensor):
-        raise TypeError(f"DLS: dictionary is a {type(dictionary).__name__}, a tensor is needed")
-    if dictionary.ndim not in (2, 3) or dictionary.shape[-2] != patches.n_pixels or 0 in dictionary.shape:
-        wanted = f"(n, K) or (N, n, K) with n = {patches.n_pixels}"
-        raise ValueError(f"DLS: dictionary {tuple(dictionary.shape)} given, {wanted} is needed")
-    norms = dictionary.detach().norm(dim=-2)
-    if not bool((norms.isfinite() & (norms > 0)).all()):
-        raise ValueError("DLS: dictionary has an atom that is zero or not finite")
+    That sweep also fits the heights continued beyond the mask, which the objective does not count.
+    """
+    cost = R.square().sum(1, keepdim=True) + penalty(B, mu[:, None, None]).sum(1, keepdim=True)
+    pays = cost <= bare.square().sum(1, keepdim=True)
+    return torch.where(pays, R, bare), torch.where(pays, B, 0)

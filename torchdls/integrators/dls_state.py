@@ -78,7 +78,8 @@ def merge(parts: list[Part]) -> State:
         return parts[0].state
     order = torch.cat([p.surfaces for p in parts]).argsort()
     columns = zip(*(p.state for p in parts), strict=True)
-    return State(*(torch.cat(c)[order] if sum(map(len, c)) == len(order) else c[0] for c in columns))
+    # A dictionary that all share went through the parts as it was.
+    return State(*(c[0] if all(t is c[0] for t in c) else torch.cat(c)[order] for c in columns))
 
 
 def patch_cost(R: Tensor, B: Tensor, mu: Tensor, valid: Tensor | None) -> Tensor:

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls.operators import edge_slopes
+
 
 class Gauge(NamedTuple):
     """The null space of (*): one constant on every connected component that no anchor holds.
@@ -75,3 +77,19 @@ def free_constants(w: Tensor, r: Tensor | None) -> Gauge:
         held = torch.zeros_like(ones).scatter_add(1, labels, (r > 0).to(w.dtype).flatten(1))
         share = torch.where(held.gather(1, labels) > 0, 0, share)
     return Gauge(labels, share)
+
+
+def remove_free_constants(z: Tensor, mask: Tensor | None = None, r: Tensor | None = None) -> Tensor:
+    """Give z zero mean on each connected component of the mask that no anchor holds.
+
+    Args:
+        z: (N, 1, H, W), 0 outside the mask.
+        mask: (N, 1, H, W) bool, or None for full rectangles.
+        r: anchor weights (N, 1, H, W) or (N, 1, 1, 1), or None for no anchor.
+    """
+    if mask is None:
+        free = z.mean((-2, -1), keepdim=True)
+        return z - (free if r is None else torch.where((r > 0).any(-1, keepdim=True).any(-2, keepdim=True), 0, free))
+    _, linked = edge_slopes(z.detach().expand(-1, 2, -1, -1), mask)
+    assert linked is not None
+    return free_constants(linked, None if r is None else r.expand_as(z)).remove(z)

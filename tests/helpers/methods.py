@@ -1,0 +1,92 @@
+"""How each integrator is tested: the table that drives the contract tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.helpers.fields import MASKS, random_field, seeded
+from torchdls import INTEGRATORS, Integrator
+
+
+@dataclass(frozen=True)
+class Method:
+    """How one integrator is tested.
+
+    `options` make it small and quick. `tol` is the relative error up to which promises hold in float64 (solvers stop,
+    thresholds switch). `smallest` is the smallest side of an image it takes. `no` maps a promise (a test's name
+    without `test_`) to the reason why the method does not make it.
+    """
+
+    options: dict[str, Any] = field(default_factory=dict)
+    tol: float = 1e-6
+    smallest: int = 1
+    no: dict[str, str] = field(default_factory=dict)
+
+    def build(self, name: str, **more: Any) -> Integrator:
+        return INTEGRATORS[name](**{**self.options, **more})
+
+
+METHODS: dict[str, Method] = {
+    "least_squares": Method({"tol": 1e-12}),
+    "frankot_chellappa": Method(no={"plane_is_exact": "a plane is not periodic"}),
+    "horn_brooks": Method({"tol": 1e-5, "relaxation": 1.8}, tol=2e-3),
+    "spectral_regularization": Method(no={"plane_is_exact": "a few cosines do not make a plane"}),
+    "dls": Method(
+        {"patch_size": 4, "stride": 2, "n_atoms": 16, "mu": 0.3, "n_iter": 3, "tol": 0.0, "unused": "keep"},
+        tol=1e-4,
+        smallest=4,
+        no={
+            "plane_is_exact": "codes below mu are lost; it holds for mu='auto' and order='block' (see test_dls.py)",
+            "scales_with_the_slopes": "mu is a fixed height; with mu='auto' it holds (tested in test_dls.py)",
+            "components_are_independent": "they share one dictionary",
+            "follows_a_transpose": "atoms are updated one after the other, and a transpose permutes them",
+            "follows_a_quarter_turn": "as for the transpose",
+        },
+    ),
+}
+
+
+def method(name: str) -> Method:
+    return METHODS.get(name, Method(tol=1e-4))
+
+
+def promising(name: str, promise: str) -> str:
+    """The name, unless the method does not make the promise: then the test is skipped with the reason."""
+    if reason := method(name).no.get(promise):
+        pytest.skip(f"{name}: {reason}")
+    return name
+
+
+def needs(name: str, *arguments: str) -> None:
+    """Skip where the method does not take an argument; that it then refuses it is `test_refuses_what_it_ignores`."""
+    if missing := set(arguments) - INTEGRATORS[name].accepts:
+        pytest.skip(f"{name} takes no {', '.join(sorted(missing))}")
+
+
+def bumps(n: int = 1, h: int = 16, w: int = 14, noise: float = 0.05) -> Tensor:
+    """Slopes (n, 2, h, w) of smooth waves, different on each surface, with some noise."""
+    y, x = torch.meshgrid(torch.arange(h, dtype=torch.float64), torch.arange(w, dtype=torch.float64), indexing="ij")
+    slopes = [
+        torch.stack([torch.cos(x / 3 + i) * torch.cos(y / 5), torch.sin(x / 3 + i) * torch.sin(y / 5) + 0.1 * i])
+        for i in range(n)
+    ]
+    return torch.stack(slopes) + noise * random_field(n, 2, h, w, seed=11)
+
+
+def everything(integrator: Integrator, g: Tensor) -> dict[str, Tensor]:
+    """All the optional arguments that a method takes."""
+    n, _, h, w = g.shape
+    known = {
+        "mask": {"mask": MASKS["disk"](h, w)},
+        "weight": {"weight": torch.rand(n, 1, h, w, dtype=g.dtype, generator=seeded(5)) + 0.5},
+        "anchor": {
+            "anchor": random_field(n, 1, h, w, seed=6).to(g.dtype),
+            "anchor_weight": torch.full((n, 1, h, w), 0.5, dtype=g.dtype),
+        },
+    }
+    return {key: value for label in integrator.accepts for key, value in known[label].items()}
