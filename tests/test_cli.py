@@ -269,9 +269,10 @@ def test_demo_leaves_everything_it_promises(tmp_path, capsys):
     assert main(["demo", "--out", str(folder), "--size", "40", "--quiet"]) == 0
     table = capsys.readouterr().out.splitlines()
     assert table[0].split() == ["surface", "SNR", "method", "RMSE", "SSIM", "angle", "seconds"]
-    assert [line.split()[:2] for line in table[1:5]] == [["Tent", "1dB"]] * 2 + [["Terrain", "0dB"]] * 2
+    assert [line.split()[:2] for line in table[1:7]] == [["Tent", "1dB"]] * 3 + [["Terrain", "0dB"]] * 3
     names = {f"{s}.{e}" for s in ("tent", "terrain") for e in ("png", "html")}
-    names |= {f"{s}_{m}.{e}" for s in ("tent", "terrain") for m in ("least_squares", "dls") for e in ("npz", "ply")}
+    methods = ("least_squares", "dls", "slope_dls")
+    names |= {f"{s}_{m}.{e}" for s in ("tent", "terrain") for m in methods for e in ("npz", "ply")}
     assert {p.name for p in folder.iterdir()} == names
     with np.load(folder / "tent_dls.npz") as file:
         assert {"height", "mask", "gradient", "truth", "snr_db"} <= set(file.files)
@@ -288,3 +289,10 @@ def test_a_normal_map_reads_as_the_library_reads_it(tmp_path):
     gradient = normals_to_gradient(io.load_field(tmp_path / "n.png").values).gradient
     main(["integrate", str(tmp_path / "n.png"), "--method", "least_squares", "-o", str(tmp_path / "z.npz"), "--quiet"])
     assert io.load_field(tmp_path / "z.npz").values.equal(gradient)
+
+
+def test_the_default_method_tells_the_noise_it_found(tmp_path, gradient_file, capsys):
+    assert main(["integrate", str(gradient_file), "-o", str(tmp_path / "z.npz")]) == 0
+    line = capsys.readouterr().out
+    assert line.startswith("slope_dls: ")
+    assert "noise " in line

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import inspect
 import os
 import sys
 import textwrap
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from torchdls.integrators import Integrator
     from torchdls.io import Field
 
-_METHOD = "dls"
+_METHOD = "slope_dls"
 _EXAMPLES = """\
 examples:
   torchdls demo --out demo
@@ -113,9 +114,9 @@ def _add_integrate(commands: Any) -> None:
 def _add_demo(commands: Any) -> None:
     command = commands.add_parser(
         "demo",
-        help="noisy slopes of the paper's Tent and of real terrain, by least squares and DLS",
-        description="Integrate the noisy slopes of the paper's Tent (1 dB) and of real terrain (0 dB) by least squares "
-        "and DLS; print a table, and write pictures, 3-D pages, meshes and arrays.",
+        help="noisy slopes of the paper's Tent and of real terrain, by least squares, DLS and SlopeDLS",
+        description="Integrate the noisy slopes of the paper's Tent (1 dB) and of real terrain (0 dB) by least "
+        "squares, DLS and SlopeDLS; print a table, and write pictures, 3-D pages, meshes and arrays.",
     )
     command.add_argument("--out", default="demo", metavar="DIR", help="folder for the results (default: demo)")
     command.add_argument("--size", type=int, metavar="N", help="side of the surfaces in pixels (default: 200 and 320)")
@@ -172,11 +173,16 @@ def _bar(label: str, method: Integrator, quiet: bool) -> Iterator[Any]:
         yield step
 
 
-def _run(label: str, method: Integrator, quiet: bool, gradient: Tensor, **fields: Tensor | None) -> Tensor:
+def _run(
+    label: str, method: Integrator, quiet: bool, gradient: Tensor, **fields: Tensor | None
+) -> tuple[Tensor, Tensor | None]:
+    """The height, and the noise level if the method found one."""
+    solve: Any = getattr(method, "solve", None)
+    if solve is None or "callback" not in inspect.signature(solve).parameters:
+        return method(gradient, **fields), None
     with _bar(label, method, quiet) as step:
-        if step is None:
-            return method(gradient, **fields)
-        return method.solve(gradient, **fields, callback=step).height  # type: ignore[operator]
+        result = solve(gradient, **fields, callback=step)
+    return result.height, getattr(result, "noise", None)
 
 
 # --- torchdls integrate --------------------------------------------------------------------------------------------
@@ -202,14 +208,15 @@ def _integrate(arguments: argparse.Namespace) -> None:
     weight = None if field.weight is None else field.weight.to(dtype)
     start = time.perf_counter()
     with torch.no_grad():
-        height = _run(arguments.method, method, arguments.quiet, gradient, mask=mask, weight=weight)
+        height, noise = _run(arguments.method, method, arguments.quiet, gradient, mask=mask, weight=weight)
     seconds = time.perf_counter() - start
     for path in arguments.out:
         _save(path, height, mask, gradient, pixel_size, camera, arguments.force)
     if not arguments.quiet:
         h, w = height.shape[-2:]
         pixels = f"{int(mask.sum())} of {h * w} pixels" if mask is not None else f"{h} x {w} pixels"
-        print(f"{arguments.method}: {pixels} in {seconds:.2f} s -> {', '.join(arguments.out)}")
+        level = "" if noise is None else f", noise {float(noise):.3g} in the slopes,"
+        print(f"{arguments.method}: {pixels}{level} in {seconds:.2f} s -> {', '.join(arguments.out)}")
 
 
 def _pixel_size(
@@ -330,11 +337,11 @@ def _demo_surface(arguments: argparse.Namespace, folder: Path, name: str, surfac
 
     noisy = add_noise(surface.gradient, snr, torch.Generator().manual_seed(arguments.seed))
     heights, notes = {}, {}
-    for label, method in (("Least squares", "least_squares"), ("DLS", "dls")):
+    for label, method in (("Least squares", "least_squares"), ("DLS", "dls"), ("SlopeDLS", "slope_dls")):
         integrator = _method(method, (1.0, 1.0))
         start = time.perf_counter()
         with torch.no_grad():
-            height = _run(f"{name}, {label}", integrator, arguments.quiet, noisy)
+            height, _ = _run(f"{name}, {label}", integrator, arguments.quiet, noisy)
         seconds = time.perf_counter() - start
         m = describe(height, surface.height, data_range=surface.data_range, gradient=surface.gradient)
         row = (
