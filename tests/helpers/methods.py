@@ -48,6 +48,17 @@ METHODS: dict[str, Method] = {
             "follows_a_quarter_turn": "as for the transpose",
         },
     ),
+    "slope_dls": Method(
+        {"patch_sizes": (4, 8), "n_iter": 3},
+        tol=1e-4,
+        smallest=2,
+        no={
+            "components_are_independent": "they share one dictionary",
+            "follows_flips": "the grid of the patches shifts to one side",
+            "follows_a_transpose": "atoms are updated one after the other, and a transpose permutes them",
+            "follows_a_quarter_turn": "as for flips and the transpose",
+        },
+    ),
 }
 
 
