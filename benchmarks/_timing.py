@@ -1,0 +1,45 @@
+"""Timing that neighbours on the machine disturb least: candidates take turns, and medians are compared."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median, quantiles
+from typing import Any
+
+
+def interleaved(
+    candidates: dict[str, Callable[[], Any]], seconds: float = 4.0, least: int = 3
+) -> dict[str, list[float]]:
+    """Times of every candidate, run in turn (A B C A B C ..) until the time is up, after one untimed round."""
+    for run in candidates.values():
+        run()
+    times: dict[str, list[float]] = {name: [] for name in candidates}
+    end = time.perf_counter() + seconds
+    while time.perf_counter() < end or len(next(iter(times.values()))) < least:
+        for name, run in candidates.items():
+            start = time.perf_counter()
+            run()
+            times[name].append(time.perf_counter() - start)
+    return times
+
+
+def statistics(times: list[float]) -> dict[str, float]:
+    """Median and quartiles in milliseconds."""
+    low, _, high = quantiles(times, n=4) if len(times) > 1 else (times[0],) * 3
+    return {"median_ms": 1e3 * median(times), "q1_ms": 1e3 * low, "q3_ms": 1e3 * high, "runs": len(times)}
+
+
+def peak_megabytes() -> float:
+    """Largest resident size of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def fresh_process(script: str, *arguments: str) -> str:
+    """What a script prints in a process of its own."""
+    command = [sys.executable, script, *arguments]
+    return subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True).stdout

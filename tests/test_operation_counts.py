@@ -1,0 +1,72 @@
+"""What the inner loops cost in operations: an accidental copy or loop shows here, without a clock."""
+
+from collections import Counter
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from torchdls import DLS, SURFACES, LeastSquares, Patches
+from torchdls.dictionary.soup_dil import residual_sweep
+
+VIEWS = {"view", "slice", "select", "transpose", "expand", "unsqueeze", "as_strided", "detach", "split", "alias", "t"}
+VIEWS |= {"permute", "_unsafe_view", "unfold", "squeeze", "view_as_real", "view_as_complex", "diagonal", "unbind"}
+
+
+class Operations(TorchDispatchMode):
+    """Counts the operations that compute or copy, and the large ones among them."""
+
+    def __init__(self, large):
+        super().__init__()
+        self.count, self.large, self.least = Counter(), Counter(), large
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        name = func.overloadpacket.__name__
+        if name not in VIEWS:
+            self.count[name] += 1
+            self.large[name] += isinstance(out, torch.Tensor) and out.numel() >= self.least
+        return out
+
+
+def noisy(size=96):
+    gradient = SURFACES["tent"](size, dtype=torch.float32).gradient
+    return gradient + 0.1 * torch.randn(gradient.shape, generator=torch.Generator().manual_seed(0))
+
+
+def codes_of(order):
+    result = DLS(order=order, n_iter=2, tol=0.0).solve(noisy())
+    P, D, B = Patches().extract(result.height), result.dictionary, result.codes
+    return (P.mT - B.mT @ D.mT).mT, D, B
+
+
+@pytest.mark.parametrize("order, total", [("block", 1000), ("atom", 2400)])
+def test_sweep(order, total):
+    """A few operations for every atom, on its row alone; the residual is met once or twice for every group."""
+    R, D, B = codes_of(order)
+    with Operations(large=R.numel()) as seen:
+        residual_sweep(R, D, B, 0.2, order=order)
+    assert seen.count.total() < total
+    assert seen.large.total() <= 8  # updates of the residual in place, and no copy of it
+    assert not any(seen.large[name] for name in ("clone", "copy_", "cat", "_to_copy"))
+
+
+def test_least_squares_is_two_transforms():
+    g = noisy()
+    with Operations(large=g.numel() // 2) as seen:
+        LeastSquares()(g)
+    assert seen.count["_fft_r2c"] == 1
+    assert seen.count["_fft_c2r"] == 1
+    assert seen.count.total() < 60
+    assert seen.large.total() < 20
+
+
+def test_iteration_of_dls_touches_the_patches_a_few_times():
+    g, marks = noisy(), []
+    with Operations(large=45 * 45 * 64) as seen:
+        DLS(order="block", n_iter=3, tol=0.0).solve(
+            g, callback=lambda *_: marks.append((seen.count.total(), seen.large.total()))
+        )
+    (count, large), (count_before, large_before) = marks[2], marks[1]
+    assert count - count_before < 1700
+    assert large - large_before <= 12
