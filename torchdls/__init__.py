@@ -51,6 +51,13 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.operators import dct2 as dct2
     from torchdls.operators import edge_slopes as edge_slopes
     from torchdls.operators import idct2 as idct2
+    from torchdls.photometric import PhotometricResult as PhotometricResult
+    from torchdls.photometric import cast_shadows as cast_shadows
+    from torchdls.photometric import low_rank_normals as low_rank_normals
+    from torchdls.photometric import render as render
+    from torchdls.photometric import ring_of_lights as ring_of_lights
+    from torchdls.photometric import sparse_normals as sparse_normals
+    from torchdls.photometric import woodham as woodham
     from torchdls.plot import compare_heights as compare_heights
     from torchdls.plot import hillshade as hillshade
     from torchdls.plot import page_html as page_html
@@ -105,6 +112,14 @@ _MODULE_OF = {
     "height_to_points": "geometry",
     "log_depth_to_depth": "geometry",
     "normals_to_gradient": "geometry",
+    # images to normals
+    "PhotometricResult": "photometric",
+    "cast_shadows": "photometric",
+    "low_rank_normals": "photometric",
+    "render": "photometric",
+    "ring_of_lights": "photometric",
+    "sparse_normals": "photometric",
+    "woodham": "photometric",
     # files and pictures
     "load_camera": "io",
     "load_field": "io",
