@@ -19,8 +19,6 @@
 # least squares turns that noise into bumps; DLS takes most of them out.
 
 # %%
-import math
-
 import matplotlib.pyplot as plt
 import torch
 
@@ -35,24 +33,18 @@ surface = torchdls.SURFACES["peaks"](96)  # height (1, 1, H, W) and exact gradie
 # lights stand on a ring, 30 degrees from the viewer. Noise: 17 dB, as in the paper's experiment on real pictures.
 
 # %%
-turn = torch.arange(10) * (2 * math.pi / 10)
-tilt = torch.tensor(math.radians(30))
-lights = torch.stack([tilt.sin() * turn.cos(), tilt.sin() * turn.sin(), tilt.cos().expand(10)], 1)
-
+lights = torchdls.ring_of_lights(10, tilt=30)
 normals = torchdls.gradient_to_normals(surface.gradient)
-clean = torch.einsum("kc,nchw->nkhw", lights, normals).clamp(min=0)
-sigma = clean.square().mean().sqrt() * 10 ** (-17 / 20)
-images = clean + sigma * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+images = torchdls.render(normals, lights, snr_db=17, generator=torch.Generator().manual_seed(0))
 
 # %% [markdown]
 # ## From pictures to a surface
 #
-# Least squares over the ten lights gives the albedo times the normal (Woodham 1980); only its direction matters for
-# the slopes. `DLS()` measures the noise of the slopes itself and needs no parameter.
+# Least squares over the ten lights gives the albedo times the normal (Woodham 1980). `DLS()` measures the noise of the slopes itself and needs no parameter.
 
 # %%
-scaled_normals = torch.einsum("ck,nkhw->nchw", torch.linalg.pinv(lights), images)
-gradient = torchdls.NormalsToGradient()(scaled_normals)
+found = torchdls.woodham(images, lights)  # normals, albedo and confidence
+gradient = torchdls.NormalsToGradient()(found.normals)
 plain = torchdls.LeastSquares()(gradient)
 height = torchdls.DLS()(gradient)
 
