@@ -41,7 +41,9 @@ VARIANTS: dict[str, dict[str, Callable[[], Integrator]]] = {
         "block": dls(order="block", n_sweeps=2, bound=3.0),
         "shared": dls(learn="shared", pixel_size=(0.5, 1.5)),
         "proximal": dls(z_step="proximal", n_prox=2),
-        "fixed": dls(learn="fixed"),
+        "soft": dls(threshold="soft", mu="auto"),
+        "firm": dls(threshold="firm", order="block"),
+        "fixed": dls(learn="fixed", grad="unroll"),
     },
     "slope_dls": {
         "default": slope_dls(),

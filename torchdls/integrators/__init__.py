@@ -2,7 +2,8 @@
 
 from torchdls._registry import INTEGRATORS
 from torchdls.integrators.base import Fields, Integrator
-from torchdls.integrators.dls import DLS, DLSResult, dls_objective
+from torchdls.integrators.dls import DLS, DLSResult
+from torchdls.integrators.dls_objective import dls_objective
 from torchdls.integrators.fourier import FrankotChellappa
 from torchdls.integrators.horn_brooks import HornBrooks
 from torchdls.integrators.least_squares import LeastSquares

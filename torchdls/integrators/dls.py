@@ -7,15 +7,17 @@ from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchdls._tape import visible
 from torchdls.dictionary import dct_dictionary
 from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
-from torchdls.dictionary.thresholds import penalty
+from torchdls.dictionary.thresholds import Threshold
 from torchdls.integrators.base import Fields, Integrator, edge_cost
 from torchdls.integrators.dls_checks import check_dictionary, check_size, parameter, per_surface
-from torchdls.integrators.dls_state import Model, Part, State, merge, patch_cost
+from torchdls.integrators.dls_implicit import at_fixed_point
+from torchdls.integrators.dls_options import Grad, Learn, check_options, derivative, keep
+from torchdls.integrators.dls_state import Model, Part, State, merge, patch_cost, worthwhile
 from torchdls.integrators.least_squares import LeastSquares
 from torchdls.integrators.window import live_window
 from torchdls.noise import noise_level
@@ -96,7 +98,15 @@ class DLS(Integrator):
         unused: rule for atoms that no patch uses, "first" or "keep" (see `soup_dil_sweep`).
         tol: a surface stops once a step moves its height by less than `tol` times the whole way from the first height;
             0 runs all iterations.
+        threshold: "hard" (the paper's), or "soft" or "firm" (see `torchdls.dictionary.thresholds`), with which `mu` can
+            be trained.
         z_tol: relative residual of the exact z-step.
+        grad: what the derivative is (docs/differentiation.md). "unroll": of the iterations that were run, exact.
+            "implicit": of the fixed point, for a fixed dictionary, at the cost of one linear solve.
+            "frozen_dictionary": the same as if the learned dictionary did not move, an approximation. "none". "auto" is
+            "implicit" where that is exact and "unroll" elsewhere.
+        grad_tol: relative residual of the linear solve of an implicit derivative.
+        checkpoint: save memory of an unrolled derivative by running each iteration again in the backward pass.
         pixel_size: (dx, dy) or one number; heights come out in its unit.
 
     Raises:
@@ -106,6 +116,10 @@ class DLS(Integrator):
     Source: Wagenmaker, Moore, Nadakuditi, "Robust surface reconstruction from gradients via adaptive dictionary
     regularization", ICIP 2017.
     """
+
+    lam: float | Tensor | str
+    mu: float | Tensor | str
+    dictionary: Tensor
 
     def __init__(
         self,
@@ -120,13 +134,17 @@ class DLS(Integrator):
         z_step: Literal["exact", "proximal"] = "exact",
         order: Order = "atom",
         *,
-        learn: Literal["each", "shared", "fixed"] = "each",
+        learn: Learn = "each",
         n_sweeps: int = 1,
         n_prox: int = 1,
         bound: float = math.inf,
         unused: Unused = "first",
+        threshold: Threshold = "hard",
         tol: float = 1e-3,
         z_tol: float = 1e-6,
+        grad: Grad = "auto",
+        grad_tol: float = 1e-4,
+        checkpoint: bool = False,
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(pixel_size=pixel_size)
@@ -136,30 +154,19 @@ class DLS(Integrator):
             raise TypeError(f"DLS: data_term is a {type(data_term).__name__}, an Integrator is needed")
         if not self.data_term.quadratic:
             raise ValueError(f"DLS: data_term {type(data_term).__name__} is not built on the weighted solve")
-        for name, value, known in (
-            ("z_step", z_step, ("exact", "proximal")),
-            ("order", order, ("atom", "block")),
-            ("learn", learn, ("each", "shared", "fixed")),
-            ("unused", unused, ("first", "keep")),
-        ):
-            if value not in known:
-                raise ValueError(f"DLS: {name}={value!r} is unknown; choose from {', '.join(map(repr, known))}")
-        for name, number, least in (("n_iter", n_iter, 0), ("n_sweeps", n_sweeps, 1), ("n_prox", n_prox, 1)):
-            if not isinstance(number, int) or number < least:
-                raise ValueError(f"DLS: {name}={number!r} given, an integer of at least {least} is needed")
-        if not bound > 0 or not tol >= 0 or not z_tol > 0:
-            raise ValueError(f"DLS: bound={bound!r} and z_tol={z_tol!r} must be positive, tol={tol!r} not negative")
-        self.lam = parameter("lam", lam)
-        self.mu = parameter("mu", mu)
+        options = {"z_step": z_step, "order": order, "learn": learn, "unused": unused, "threshold": threshold}
+        counts = {"n_iter": n_iter, "n_sweeps": n_sweeps, "n_prox": n_prox}
+        check_options(**options, **counts, grad=grad, bound=bound, tol=tol, z_tol=z_tol, grad_tol=grad_tol)
+        keep(self, "lam", parameter("lam", lam))
+        keep(self, "mu", parameter("mu", mu))
         self.n_iter, self.n_sweeps, self.n_prox = n_iter, n_sweeps, n_prox
-        self.z_step, self.order, self.learn, self.unused = z_step, order, learn, unused
-        self.bound, self.tol, self.z_tol = bound, tol, z_tol
+        self.z_step, self.order, self.learn, self.unused, self.threshold = z_step, order, learn, unused, threshold
+        self.bound, self.tol, self.z_tol, self.grad_tol = bound, tol, z_tol, grad_tol
+        self.checkpoint = checkpoint
         initial = dct_dictionary(self.patches.size, n_atoms) if dictionary is None else dictionary
         check_dictionary(initial, self.patches)
-        if isinstance(initial, nn.Parameter):
-            self.dictionary = initial
-        else:
-            self.register_buffer("dictionary", initial.detach().clone())
+        keep(self, "dictionary", initial)
+        self.grad = derivative(grad, learn, threshold, self._steady, initial)
 
     def integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
@@ -196,18 +203,34 @@ class DLS(Integrator):
         check_size(fields.gradient, self.patches)
         noise = self._noise(fields)
         window = live_window(fields.mask, self.patches)
+        fields = fields if window is None else window.crop(fields)
+        result = self._differentiated(self._model(fields, noise), callback)
+        height = remove_free_constants(result.height, fields.mask, fields.anchor_weight)
         if window is None:
-            return self._run_within(fields, noise, callback)
-        result = self._run_within(window.crop(fields), noise, callback)
-        return result._replace(height=window.put_back(result.height), codes=window.put_codes_back(result.codes))
+            return result._replace(height=height)
+        return result._replace(height=window.put_back(height), codes=window.put_codes_back(result.codes))
 
-    def _run_within(self, fields: Fields, noise: Tensor, callback: Callback | None) -> DLSResult:
-        model = self._model(fields, noise)
+    def _differentiated(self, model: Model, callback: Callback | None) -> DLSResult:
+        """The result of the iterations, with the derivative that was chosen."""
+        if self.grad == "unroll":
+            return self._run_within(model, callback)
+        with torch.no_grad():
+            found = self._run_within(model, callback)
+        found = DLSResult(*(t.detach() for t in found))
+        if self.grad == "none":
+            return found
+        D = self._initial_dictionary(model.fields) if self.learn == "fixed" else found.dictionary
+        height, codes = at_fixed_point(
+            model, found.height, D, found.codes, threshold=self.threshold, bound=self.bound, tol=self.grad_tol
+        )
+        return found._replace(height=height, dictionary=D, codes=codes, noise=model.noise, lam=model.lam, mu=model.mu)
+
+    def _run_within(self, model: Model, callback: Callback | None) -> DLSResult:
         state = self._start(model)
         objective = [self._objective(model, state)]
         active = torch.ones_like(model.noise, dtype=torch.bool)
         running, parts = model, [Part(torch.arange(len(active), device=active.device), state)]
-        look = self.tol > 0 and visible(fields.gradient)
+        look = self.tol > 0 and visible(model.fields.gradient)
         for iteration in range(1, self.n_iter + 1):
             index, old = parts[-1]
             new = self._iterate(running, old, first=iteration == 1)
@@ -227,8 +250,7 @@ class DLS(Integrator):
                 running = running.part(~settled)
         objective += [objective[-1]] * (self.n_iter + 1 - len(objective))
         end = merge(parts)
-        z = remove_free_constants(end.z, fields.mask, fields.anchor_weight)
-        return DLSResult(z, end.D, end.B, torch.stack(objective, 1), model.noise, model.lam, model.mu, ~active)
+        return DLSResult(end.z, end.D, end.B, torch.stack(objective, 1), model.noise, model.lam, model.mu, ~active)
 
     def _start(self, model: Model) -> State:
         """Heights of the data term alone, and no codes: the patches are the residual."""
@@ -255,12 +277,20 @@ class DLS(Integrator):
         bare = torch.where(model.valid, R, 0) if first and model.valid is not None else None
         for _ in range(self.n_sweeps):
             R, D, B = residual_sweep(
-                R, D, B, model.mu[:, None], self.bound, self.order, unused=self.unused, learn=self.learn != "fixed"
+                R,
+                D,
+                B,
+                model.mu[:, None],
+                self.bound,
+                self.order,
+                unused=self.unused,
+                learn=self.learn != "fixed",
+                threshold=self.threshold,
             )
             # Filling the invalid pixels of a patch by its approximation D b means: no residual there.
             R = R if model.valid is None else torch.where(model.valid, R, 0)
             if bare is not None:
-                R, B = _worthwhile(bare, R, B, model.mu)
+                R, B = worthwhile(bare, R, B, model.mu, self.threshold)
                 bare = None
         z = self._step(model, state.z, R)
         return State(state.start, z, model.patches.extract_onto(R, z - state.z), D, B)
@@ -278,9 +308,7 @@ class DLS(Integrator):
         lam = per_surface("lam", self.lam, _AUTO_LAM * torch.ones_like(noise))
         mu = per_surface("mu", self.mu, _AUTO_MU * noise)
         coverage = self.patches.coverage(shape, dtype=gradient.dtype, device=gradient.device)
-        kind = type(self.data_term)
-        settled = kind.edges is Integrator.edges and kind.data_cost is Integrator.data_cost
-        edges = self.data_term.edges(fields) if settled else None
+        edges = self.data_term.edges(fields) if self._steady else None
         if mask is None:
             return Model(fields, self.patches, coverage, None, edges, noise, lam, mu)
         valid = self.patches.extract(mask.to(gradient.dtype)) > 0
@@ -298,6 +326,12 @@ class DLS(Integrator):
             if isinstance(self.mu, str):
                 raise ValueError(f"DLS: mu='auto' finds no noise level, give a number ({error})") from error
             return fields.gradient.new_full((len(fields.gradient),), math.nan)
+
+    @property
+    def _steady(self) -> bool:
+        """Whether the data term is one quadratic, whatever the height."""
+        kind = type(self.data_term)
+        return kind.edges is Integrator.edges and kind.data_cost is Integrator.data_cost
 
     def _initial_dictionary(self, fields: Fields) -> Tensor:
         D = self.dictionary.to(fields.gradient)
@@ -335,60 +369,9 @@ class DLS(Integrator):
         cost = self.data_term.data_cost(fields, z) if model.edges is None else edge_cost(z, *model.edges, fields.steps)
         if fields.anchor is not None and fields.anchor_weight is not None:
             cost = cost + 0.5 * (fields.anchor_weight * (z - fields.anchor).square()).sum((-3, -2, -1))
-        return cost + model.lam * patch_cost(state.R, state.B, model.mu, model.valid)
+        return cost + model.lam * patch_cost(state.R, state.B, model.mu, model.valid, self.threshold)
 
     def extra_repr(self) -> str:
         """The settings, as `print` shows them."""
-        names = ("lam", "mu", "n_iter", "z_step", "order", "learn", "tol", "pixel_size")
+        names = ("lam", "mu", "n_iter", "z_step", "order", "learn", "threshold", "grad", "tol", "pixel_size")
         return f"{self.patches}, " + ", ".join(f"{n}={getattr(self, n)!r}" for n in names)
-
-
-def dls_objective(
-    height: Tensor,
-    gradient: Tensor,
-    dictionary: Tensor,
-    codes: Tensor,
-    lam: float | Tensor,
-    mu: float | Tensor,
-    *,
-    patches: Patches | None = None,
-    mask: Tensor | None = None,
-    weight: Tensor | None = None,
-) -> Tensor:
-    r"""The cost that DLS minimises, per surface.
-
-        1/2 \sum_e w_e ((A z)_e - v_e)^2 + lam ( \sum_j ||M_j (P_j z - D b_j)||^2 + mu^2 ||B||_0 )
-
-    with M_j the valid pixels of patch j (all of them without a mask).
-
-    Args:
-        height: (N, 1, H, W), in pixels.
-        gradient: (N, 2, H, W).
-        dictionary: (N or 1, n, K).
-        codes: (N, K, L).
-        lam: a number or (N,).
-        mu: a number or (N,).
-        patches: the patches; `Patches(8, 2)` by default.
-        mask: (N, 1, H, W) bool.
-        weight: (N, 1 or 2, H, W).
-
-    Returns:
-        (N,).
-    """
-    patches = Patches() if patches is None else patches
-    data = LeastSquares()
-    fields = data.check(gradient, mask, weight)
-    valid = None if fields.mask is None else patches.extract(fields.mask.to(height.dtype)) > 0
-    mu = torch.as_tensor(mu, dtype=height.dtype, device=height.device).expand(height.shape[0])
-    R = patches.extract(height) - dictionary @ codes
-    return data.data_cost(fields, height) + lam * patch_cost(R, codes, mu, valid)
-
-
-def _worthwhile(bare: Tensor, R: Tensor, B: Tensor, mu: Tensor) -> tuple[Tensor, Tensor]:
-    """Residual and codes after the first sweep; patches that are better off without codes keep their bare residual.
-
-    That sweep also fits the heights continued beyond the mask, which the objective does not count.
-    """
-    cost = R.square().sum(1, keepdim=True) + penalty(B, mu[:, None, None]).sum(1, keepdim=True)
-    pays = cost <= bare.square().sum(1, keepdim=True)
-    return torch.where(pays, R, bare), torch.where(pays, B, 0)

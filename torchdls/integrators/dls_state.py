@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchdls.dictionary.thresholds import total_penalty
+from torchdls.dictionary.thresholds import Threshold, penalty, total_penalty
 from torchdls.integrators.base import Fields
 from torchdls.operators import Patches
 
@@ -82,8 +82,18 @@ def merge(parts: list[Part]) -> State:
     return State(*(c[0] if all(t is c[0] for t in c) else torch.cat(c)[order] for c in columns))
 
 
-def patch_cost(R: Tensor, B: Tensor, mu: Tensor, valid: Tensor | None) -> Tensor:
+def patch_cost(R: Tensor, B: Tensor, mu: Tensor, valid: Tensor | None, rule: Threshold = "hard") -> Tensor:
     """(N,) fit and penalty of the patches; only the valid pixels of a patch count."""
     R = R if valid is None else torch.where(valid, R, 0)
     flat = R.mT.flatten(1)  # as it lies in memory
-    return torch.linalg.vecdot(flat, flat) + total_penalty(B, mu)
+    return torch.linalg.vecdot(flat, flat) + total_penalty(B, mu, rule)
+
+
+def worthwhile(bare: Tensor, R: Tensor, B: Tensor, mu: Tensor, rule: Threshold) -> tuple[Tensor, Tensor]:
+    """Residual and codes after the first sweep; patches that are better off without codes keep their bare residual.
+
+    That sweep also fits the heights continued beyond the mask, which the objective does not count.
+    """
+    cost = R.square().sum(1, keepdim=True) + penalty(B, mu[:, None, None], rule).sum(1, keepdim=True)
+    pays = cost <= bare.square().sum(1, keepdim=True)
+    return torch.where(pays, R, bare), torch.where(pays, B, 0)

@@ -90,6 +90,6 @@ def remove_free_constants(z: Tensor, mask: Tensor | None = None, r: Tensor | Non
     if mask is None:
         free = z.mean((-2, -1), keepdim=True)
         return z - (free if r is None else torch.where((r > 0).any(-1, keepdim=True).any(-2, keepdim=True), 0, free))
-    _, linked = edge_slopes(z.detach().expand(-1, 2, -1, -1), mask)
+    _, linked = edge_slopes(mask.to(z.dtype).expand(-1, 2, -1, -1), mask)
     assert linked is not None
-    return free_constants(linked, None if r is None else r.expand_as(z)).remove(z)
+    return free_constants(linked, None if r is None else r.expand(mask.shape)).remove(z)

@@ -99,7 +99,7 @@ def solve(
         b = b + r * anchor
     if w is None and (r is None or r[0].numel() == 1):
         return direct_result(b, r, setting.pixel_size)
-    w = _present_edges(v) if w is None else w.expand_as(v)
+    w = present_edges(v) if w is None else w.expand_as(v)
     r = torch.zeros_like(b) if r is None else r.expand_as(b)
     return SolveResult(*_Solve.apply(b, w, r, z0, None, None, setting)[:4])
 
@@ -136,7 +136,7 @@ def _check(v: Tensor, setting: _Setting, **fields: Tensor | None) -> None:
             raise ValueError(f"solve: {name} {tuple(field.shape)} does not fit v {tuple(v.shape)}")
 
 
-def _present_edges(v: Tensor) -> Tensor:
+def present_edges(v: Tensor) -> Tensor:
     """Weight 1 on every edge of the rectangle, 0 beyond its last column and row."""
     w = torch.ones_like(v)
     w[:, 0, :, -1] = 0
@@ -168,7 +168,7 @@ class _Solve(torch.autograd.Function):
         gauge = free_constants(w, r) if labels is None or share is None else Gauge(labels, share)
         x, iterations, residual, converged = conjugate_gradients(
             _normal(w, r, setting),
-            _preconditioner(w, r, setting),
+            preconditioner(w, r, setting.pixel_size),
             gauge.remove(b),
             z0,
             tol=setting.tol,
@@ -212,16 +212,20 @@ class _Solve(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        size = info.batch_size
+        outputs = _Solve.apply(*fold_vmap(info.batch_size, in_dims, inputs))
+        return tuple(x.unflatten(0, (info.batch_size, -1)) for x in outputs), (0,) * len(outputs)
 
-        def fold(x: Any, dim: int | None) -> Any:
-            if not isinstance(x, Tensor):
-                return x
-            x = x.unsqueeze(0).expand(size, *x.shape) if dim is None else x.movedim(dim, 0)
-            return x.flatten(0, 1)
 
-        outputs = _Solve.apply(*(fold(x, d) for x, d in zip(inputs, in_dims, strict=True)))
-        return tuple(x.unflatten(0, (size, -1)) for x in outputs), (0,) * len(outputs)
+def fold_vmap(size: int, in_dims: tuple[int | None, ...], inputs: tuple[Any, ...]) -> list[Any]:
+    """The dimension that vmap maps over, folded into the batch of every tensor."""
+
+    def fold(x: Any, dim: int | None) -> Any:
+        if not isinstance(x, Tensor):
+            return x
+        x = x.unsqueeze(0).expand(size, *x.shape) if dim is None else x.movedim(dim, 0)
+        return x.flatten(0, 1)
+
+    return [fold(x, d) for x, d in zip(inputs, in_dims, strict=True)]
 
 
 def _live_window(w: Tensor, r: Tensor) -> tuple[slice, slice]:
@@ -250,7 +254,7 @@ def _normal(w: Tensor, r: Tensor, setting: _Setting) -> LinearMap:
     return lambda z: a.adjoint(w * a(z)) + r * z
 
 
-def _preconditioner(w: Tensor, r: Tensor, setting: _Setting) -> LinearMap:
+def preconditioner(w: Tensor, r: Tensor, pixel_size: tuple[float, float]) -> LinearMap:
     r"""The map b -> S (A^T A + rho)^{-1} S b: a direct solve between two diagonal scalings.
 
     With d the mean weight of a pixel's live edges and k = 2/dx^2 + 2/dy^2 the diagonal of A^T A, the scaling
@@ -260,7 +264,7 @@ def _preconditioner(w: Tensor, r: Tensor, setting: _Setting) -> LinearMap:
 
     Where the anchors hold every surface firmly the diagonal alone does nearly as well, and costs a tenth.
     """
-    k = sum(2 / d**2 for d in setting.pixel_size)
+    k = sum(2 / d**2 for d in pixel_size)
     d = edge_ends(w) / edge_ends((w > 0).to(w.dtype)).clamp(min=1)
     total = k * d + r
     alive = total > 0
@@ -270,11 +274,11 @@ def _preconditioner(w: Tensor, r: Tensor, setting: _Setting) -> LinearMap:
     rest = torch.where(alive, k * d / total, 0).sum((-2, -1), keepdim=True) / n_alive  # 1 - q without cancellation
     rho = k * q / rest.clamp(min=1e-6)
     if bool((rho > _FIRM * k).all()):
-        scale = torch.tensor(setting.pixel_size, dtype=w.dtype, device=w.device).view(1, 2, 1, 1)
+        scale = torch.tensor(pixel_size, dtype=w.dtype, device=w.device).view(1, 2, 1, 1)
         diagonal = edge_ends(w / scale.square()) + r
         return lambda b: b / torch.where(alive, diagonal, 1)
     s = torch.where(alive, ((k + rho) / total).sqrt(), 0)
-    inverse = direct_map((w.shape[-2], w.shape[-1]), rho, setting.pixel_size, w)
+    inverse = direct_map((w.shape[-2], w.shape[-1]), rho, pixel_size, w)
     return lambda b: s * inverse(s * b)
 
 

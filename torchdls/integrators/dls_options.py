@@ -1,0 +1,68 @@
+"""The options of DLS: what is allowed, and what "auto" stands for."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from torch import Tensor, nn
+
+from torchdls.dictionary.thresholds import THRESHOLDS
+
+Learn = Literal["each", "shared", "fixed"]
+Grad = Literal["auto", "unroll", "implicit", "frozen_dictionary", "none"]
+
+_WORDS = {
+    "z_step": ("exact", "proximal"),
+    "order": ("atom", "block"),
+    "learn": ("each", "shared", "fixed"),
+    "unused": ("first", "keep"),
+    "threshold": THRESHOLDS,
+    "grad": ("auto", "unroll", "implicit", "frozen_dictionary", "none"),
+}
+_COUNTS = {"n_iter": 0, "n_sweeps": 1, "n_prox": 1}
+
+
+def check_options(*, bound: float, tol: float, z_tol: float, grad_tol: float, **options: Any) -> None:
+    """ValueError for a word that is unknown, or a number out of its range."""
+    for name, known in _WORDS.items():
+        if options[name] not in known:
+            raise ValueError(f"DLS: {name}={options[name]!r} is unknown; choose from {', '.join(map(repr, known))}")
+    for name, least in _COUNTS.items():
+        if not isinstance(options[name], int) or options[name] < least:
+            raise ValueError(f"DLS: {name}={options[name]!r} given, an integer of at least {least} is needed")
+    if not bound > 0 or not tol >= 0 or not z_tol > 0 or not grad_tol > 0:
+        positive = f"bound={bound!r}, z_tol={z_tol!r} and grad_tol={grad_tol!r} must be positive"
+        raise ValueError(f"DLS: {positive}, tol={tol!r} not negative")
+
+
+def derivative(grad: Grad, learn: Learn, threshold: str, steady: bool, dictionary: Tensor) -> Grad:
+    """The kind of derivative that "auto" stands for, once the kind asked for is found to exist.
+
+    Args:
+        grad: what was asked for.
+        learn: whether the dictionary is learned.
+        threshold: rule of the codes.
+        steady: the data term is one quadratic, whatever the height.
+        dictionary: the initial dictionary.
+    """
+    possible = steady and threshold != "firm"
+    if grad == "auto":
+        return "implicit" if learn == "fixed" and possible else "unroll"
+    if grad in ("implicit", "frozen_dictionary"):
+        if not possible:
+            what = "a quadratic data term and hard or soft thresholds"
+            raise ValueError(f"DLS: grad={grad!r} needs {what}; take grad='unroll'")
+        if (grad == "implicit") != (learn == "fixed"):
+            other = "'unroll' (exact) or 'frozen_dictionary'" if grad == "implicit" else "'implicit'"
+            raise ValueError(f"DLS: grad={grad!r} does not go with learn={learn!r}; take {other}")
+        if grad == "frozen_dictionary" and isinstance(dictionary, nn.Parameter):
+            raise ValueError("DLS: grad='frozen_dictionary' gives a trained dictionary no derivative; take 'unroll'")
+    return grad
+
+
+def keep(module: nn.Module, name: str, value: float | Tensor | str) -> None:
+    """A tensor becomes a buffer, so that it moves with the module, unless it is a parameter already."""
+    if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):
+        module.register_buffer(name, value.detach().clone())
+    else:
+        setattr(module, name, value)
