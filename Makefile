@@ -52,7 +52,9 @@ types: $(VENV)/.dev
 notebooks: $(VENV)/.dev
 	@mkdir -p $(SCRATCH)/notebooks
 	@set -e; for name in $(NOTEBOOKS); do echo "notebook $$name"; \
-	$(BIN)/jupytext --quiet --to ipynb --execute --output $(SCRATCH)/notebooks/$$name.ipynb notebooks/$$name.py; done
+	$(BIN)/jupytext --quiet --to ipynb --output $(SCRATCH)/notebooks/$$name.ipynb notebooks/$$name.py; \
+	$(BIN)/jupyter nbconvert --log-level=ERROR --to notebook --execute --inplace \
+	--ExecutePreprocessor.record_timing=False $(SCRATCH)/notebooks/$$name.ipynb; done
 
 # Runs them and keeps the result beside the source.
 notebooks-update: notebooks

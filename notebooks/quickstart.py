@@ -40,7 +40,8 @@ images = torchdls.render(normals, lights, snr_db=17, generator=torch.Generator()
 # %% [markdown]
 # ## From pictures to a surface
 #
-# Least squares over the ten lights gives the albedo times the normal (Woodham 1980). `DLS()` measures the noise of the slopes itself and needs no parameter.
+# Least squares over the ten lights gives the albedo times the normal (Woodham 1980). `DLS()` measures the noise of the
+# slopes itself and needs no parameter.
 
 # %%
 found = torchdls.woodham(images, lights)  # normals, albedo and confidence

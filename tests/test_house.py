@@ -1,6 +1,7 @@
 """The house rules that a reader relies on: floors, public names, short files, nothing left over."""
 
 import ast
+import json
 import re
 import subprocess
 import sys
@@ -135,3 +136,14 @@ def test_no_path_of_one_machine() -> None:
     ]
     # Slashes inside a picture's base64 text do not match: a path begins a line or follows one of these.
     assert not matches(r"(^|[\s\"'`=(:])/(home|root|Users|work|opt|tmp)/\w", texts)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.py")), ids=lambda p: p.stem)
+def test_notebook_is_its_source_and_was_run(path: Path) -> None:
+    marked = re.split(r"^# %%(.*)\n", path.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
+    source = [text.strip() for mark, text in zip(marked[::2], marked[1::2], strict=True) if "markdown" not in mark]
+    notebook = json.loads(path.with_suffix(".ipynb").read_text(encoding="utf-8"))
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert ["".join(cell["source"]) for cell in cells] == source, "run `make notebooks-update`"
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    assert any("image/png" in output.get("data", {}) for cell in cells for output in cell["outputs"])
