@@ -79,9 +79,9 @@ def from_half_spectrum(spectrum: Tensor, size: tuple[int, int]) -> Tensor:
     return _restored(y)
 
 
-def mirrored(values: Tensor) -> Tensor:
-    """For U as real numbers (.., H, M, 2): row H - k in row k, for k = 1 .. H - 1, real and imaginary part swapped."""
-    return values[..., 1:, :, :].flip((-3, -1))
+def mirrored(spectrum: Tensor) -> Tensor:
+    """For U (.., H, M): row H - k in row k, for k = 1 .. H - 1, with real and imaginary part swapped."""
+    return spectrum[..., 1:, :].flip(-2).mul_(-1j).conj_physical_()
 
 
 def neumann_eigenvalues(shape: tuple[int, int], like: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:

@@ -13,6 +13,9 @@ from torchdls.operators.cosine import MATRIX_LIMIT, from_half_spectrum, half_spe
 from torchdls.operators.tables import table
 from torchdls.solvers.cg import LinearMap
 
+# Pixels of small surfaces that are transformed together: they stay in the cache from one pass to the next.
+_IN_CACHE = 2**17
+
 
 def solve_direct(b: Tensor, r: Tensor | float | None, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
     """(A^T A + r)^{-1} b by cosine transforms, r one number per surface (N, 1, 1, 1); zero mean where r = 0.
@@ -38,12 +41,19 @@ def direct_map(size: tuple[int, int], r: Tensor | None, pixel_size: tuple[float,
         return lambda b: idct2(dct2(b) * gain)
     own, other = _tables(size, r, pixel_size, like)
 
-    def apply(b: Tensor) -> Tensor:
+    def solve_part(b: Tensor) -> Tensor:
         spectrum = half_spectrum(b)
         values = torch.view_as_real(spectrum)
-        opposite = mirrored(values)
+        opposite = torch.view_as_real(mirrored(spectrum))
         values.mul_(own)[..., 1:, :, :].addcmul_(opposite, other, value=-1)
         return from_half_spectrum(spectrum, size)
+
+    several = max(1, _IN_CACHE // (size[0] * size[1]))
+    alike = own.ndim == 3 or len(own) == 1  # one table for all surfaces
+
+    def apply(b: Tensor) -> Tensor:
+        parts = b.split(several) if alike else (b,)
+        return torch.cat([solve_part(part) for part in parts]) if len(parts) > 1 else solve_part(b)
 
     return apply
 
