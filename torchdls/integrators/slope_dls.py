@@ -74,7 +74,8 @@ class SlopeDLS(Integrator):
 
     Args:
         patch_sizes: sides of the patches, the smallest first; those that do not fit the image are left out.
-        tau: threshold in standard deviations of the noise of an atom.
+        tau: threshold in standard deviations of the noise of an atom. Below 1, since every iteration thresholds again;
+            1.2 with 9 iterations is as good in noise and quicker, but blurs smooth surfaces above 30 dB.
         n_iter: number of iterations.
         learn: learn the dictionary of the smallest patches; False codes them by cosines too, in a third of the time.
         sigma: standard deviation of one gradient sample of weight 1: a number, (N,), or a map (N, 1, H, W), which takes
@@ -96,8 +97,8 @@ class SlopeDLS(Integrator):
     def __init__(
         self,
         patch_sizes: Sequence[int] = (8, 24, 48),
-        tau: float = 1.2,
-        n_iter: int = 9,
+        tau: float = 0.8,
+        n_iter: int = 16,
         learn: bool = True,
         *,
         sigma: float | Tensor | None = None,
