@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterable, Sequence
+from functools import reduce
 from typing import Literal, NamedTuple
 
 import torch
@@ -99,9 +99,18 @@ def residual_sweep(
     """
     in_place = not recorded(R, D, B, *([mu] if isinstance(mu, Tensor) else []))
     rule = _Rule(_levels(mu, B, in_place), bound, threshold, unused, in_place)
-    if order == "atom" and learn:
-        return _atom_order(R, D, B, rule)
-    return _block_order(R, D, B, rule, learn)
+    if not in_place or R.shape[-1] < _SHORTEST or (learn and D.shape[0] < R.shape[0]):
+        return _sweep(R, D, B, rule, order, learn)
+    # Large surfaces one by one: each has thresholds that are numbers, and zeros that can be skipped.
+    dictionaries = []
+    for i in range(R.shape[0]):
+        own = R[i : i + 1], D[i : i + 1] if len(D) > 1 else D, B[i : i + 1]
+        dictionaries.append(_sweep(*own, rule.of_surface(i), order, learn)[1])
+    return R, torch.cat(dictionaries) if learn else D, B
+
+
+def _sweep(R: Tensor, D: Tensor, B: Tensor, rule: _Rule, order: Order, learn: bool) -> tuple[Tensor, Tensor, Tensor]:
+    return _atom_order(R, D, B, rule) if order == "atom" and learn else _block_order(R, D, B, rule, learn)
 
 
 class _Rule(NamedTuple):
@@ -112,6 +121,11 @@ class _Rule(NamedTuple):
     threshold: Threshold
     unused: Unused
     in_place: bool
+
+    def of_surface(self, i: int) -> _Rule:
+        """The rule for one surface of the batch, whose thresholds are numbers."""
+        levels = [m if isinstance(m, float) else float(m[i if len(m) > 1 else 0]) for m in self.levels]
+        return self._replace(levels=levels)
 
     def shrink(self, x: Tensor, atom: int) -> Tensor:
         return shrink(x, self.levels[atom], self.bound, self.threshold)
@@ -145,7 +159,7 @@ def _block_order(R: Tensor, D: Tensor, B: Tensor, rule: _Rule, learn: bool) -> t
 
 
 def _total(products: Iterable[Tensor], shared: bool) -> Tensor:
-    total = functools.reduce(torch.add, products)
+    total = reduce(torch.add, products)
     return total.sum(0, keepdim=True) if shared else total
 
 
