@@ -10,7 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdls._tape import bool_all
-from torchdls.integrators.base import Fields, Integrator, _fit
+from torchdls.integrators.base import Integrator
+from torchdls.integrators.fields import Fields, fit_field
 from torchdls.operators.local_polynomials import (
     build_derivative,
     cosine_basis,
@@ -245,7 +246,7 @@ class TikhonovRegularization(GlobalLeastSquares):
 
     def _prior(self, prior: Tensor, gradient: Tensor) -> Tensor:
         name = type(self).__name__
-        fitted = cast(Tensor, _fit(name, "prior", prior, gradient, channels=(1,)))
+        fitted = cast(Tensor, fit_field(name, "prior", prior, gradient, channels=(1,)))
         if not bool_all(fitted.isfinite()):
             raise ValueError(f"{name}: prior {tuple(prior.shape)} is not finite")
         return fitted

@@ -1,0 +1,146 @@
+"""What integrators work on: the arguments of the call, checked and brought to one form."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchdls._tape import bool_all, visible
+
+
+class Fields(NamedTuple):
+    """The checked input of an integrator: batched, finite, zero outside the mask, and in units of one pixel.
+
+    With h = sqrt(dx dy), heights are divided by h and anchor weights multiplied by h^2. Slopes have no unit and stay.
+
+    Attributes:
+        gradient: (N, 2, H, W).
+        mask: (N, 1, H, W) bool, or None for full rectangles.
+        weight: (N, 1 or 2, H, W), or None for equal trust.
+        anchor: (N, 1, H, W), or None.
+        anchor_weight: (N, 1, H, W), or (N, 1, 1, 1) for one number per surface, or None.
+        steps: (dx / h, dy / h), the sides of a pixel of unit area.
+    """
+
+    gradient: Tensor
+    mask: Tensor | None
+    weight: Tensor | None
+    anchor: Tensor | None
+    anchor_weight: Tensor | None
+    steps: tuple[float, float]
+
+
+def _all_finite(field: Tensor) -> bool:
+    """Whether every value is finite; one sum mostly tells, and only a sum that overflows needs the second look."""
+    return not visible(field) or bool(field.detach().sum().isfinite()) or bool(field.isfinite().all())
+
+
+def _require(holds: bool, message: str) -> None:
+    if not holds:
+        raise ValueError(message)
+
+
+def check_accepted(name: str, accepts: frozenset[str], **given: object) -> None:
+    """ValueError for an argument that the method cannot honour."""
+    for label, field in given.items():
+        taken = "anchor" if label == "anchor_weight" else label
+        _require(field is None or taken in accepts, f"{name}: takes no {taken}; LeastSquares and DLS do")
+
+
+def check_gradient(name: str, gradient: Tensor) -> None:
+    """A floating-point tensor (N, 2, H, W) or (2, H, W)."""
+    if not isinstance(gradient, Tensor):
+        raise TypeError(f"{name}: gradient is a {type(gradient).__name__}, a tensor is needed")
+    if gradient.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"{name}: gradient has dtype {gradient.dtype}; float32 or float64 is needed")
+    if gradient.ndim not in (3, 4) or gradient.shape[-3] != 2 or 0 in gradient.shape:
+        raise ValueError(f"{name}: gradient {tuple(gradient.shape)} given, (N, 2, H, W) or (2, H, W) is needed")
+
+
+def fit_fields(
+    name: str,
+    gradient: Tensor,
+    mask: Tensor | None,
+    weight: Tensor | None,
+    anchor: Tensor | None,
+    anchor_weight: Tensor | float | None,
+) -> Fields:
+    """The arguments as one batch, once their types and shapes are found to fit."""
+    mask = fit_field(name, "mask", mask, gradient, channels=(1,), dtype=torch.bool)
+    weight = fit_field(name, "weight", weight, gradient, channels=(1, 2))
+    anchor = fit_field(name, "anchor", anchor, gradient, channels=(1,))
+    if isinstance(anchor_weight, int | float):
+        anchor_weight = gradient.new_full((1,) * gradient.ndim, float(anchor_weight))
+    trust = fit_field(name, "anchor_weight", anchor_weight, gradient, channels=(1,), scalar=True)
+    if (anchor is None) != (trust is None):
+        given, missing = ("anchor", "anchor_weight") if trust is None else ("anchor_weight", "anchor")
+        raise ValueError(f"{name}: {given} is given without {missing}; they come together")
+    return Fields(gradient if gradient.ndim == 4 else gradient[None], mask, weight, anchor, trust, (1.0, 1.0))
+
+
+def within_mask(name: str, fields: Fields) -> Fields:
+    """Zero outside the mask, and anchors zero where they are not trusted: NaN there goes no further."""
+    gradient, mask, weight, anchor, trust, steps = fields
+    if mask is not None:
+        some = bool_all(mask.flatten(1).any(1))
+        _require(some, f"{name}: mask {tuple(mask.shape)} is False everywhere on a surface")
+        gradient = torch.where(mask, gradient, 0)
+        weight = None if weight is None else torch.where(mask, weight, 0)
+        trust = None if trust is None else torch.where(mask, trust, 0)
+    if anchor is not None and trust is not None:
+        anchor = torch.where(trust > 0, anchor, 0)
+    return Fields(gradient, mask, weight, anchor, trust, steps)
+
+
+def check_values(name: str, fields: Fields) -> None:
+    """Finite everywhere (within the mask), and no weight negative."""
+    inside = "" if fields.mask is None else " inside the mask"
+    for label in ("gradient", "weight", "anchor", "anchor_weight"):
+        field = getattr(fields, label)
+        if field is not None:
+            _require(_all_finite(field), f"{name}: {label} {tuple(field.shape)} is not finite{inside}")
+            weight = label.endswith("weight")
+            _require(not weight or bool_all(field >= 0), f"{name}: {label} {tuple(field.shape)} is negative{inside}")
+
+
+def fit_field(
+    name: str,
+    label: str,
+    field: Tensor | None,
+    gradient: Tensor,
+    *,
+    channels: tuple[int, ...],
+    dtype: torch.dtype | None = None,
+    scalar: bool = False,
+) -> Tensor | None:
+    """The field with a batch dimension of N, once its type, shape, dtype and device are found to fit the gradient's."""
+    if field is None:
+        return None
+    if not isinstance(field, Tensor):
+        raise TypeError(f"{name}: {label} is a {type(field).__name__}, a tensor is needed")
+    dtype = gradient.dtype if dtype is None else dtype
+    if field.dtype != dtype:
+        error = TypeError if dtype == torch.bool else ValueError
+        raise error(f"{name}: {label} has dtype {field.dtype}, {dtype} is needed")
+    if field.device != gradient.device:
+        raise ValueError(f"{name}: {label} is on {field.device}, gradient on {gradient.device}")
+    sizes = (tuple(gradient.shape[-2:]), (1, 1)) if scalar else (tuple(gradient.shape[-2:]),)
+    fits = field.ndim == gradient.ndim and field.shape[-3] in channels and tuple(field.shape[-2:]) in sizes
+    if not fits or (field.ndim == 4 and field.shape[0] not in (1, gradient.shape[0])):
+        shapes = f"gradient {tuple(gradient.shape)} and {label} {tuple(field.shape)}"
+        raise ValueError(f"{name}: {shapes} {_difference(gradient, field, channels)}")
+    field = field if field.ndim == 4 else field[None]
+    return field.expand(gradient.shape[0] if gradient.ndim == 4 else 1, -1, -1, -1)
+
+
+def _difference(gradient: Tensor, field: Tensor, channels: tuple[int, ...]) -> str:
+    if field.ndim != gradient.ndim:
+        return f"differ in the number of dimensions, {gradient.ndim} and {field.ndim}"
+    if field.shape[-3] not in channels:
+        return f"do not fit: {field.shape[-3]} channels, {' or '.join(map(str, channels))} needed"
+    for dim, axis in ((-1, "width"), (-2, "height")):
+        if field.shape[dim] != gradient.shape[dim]:
+            return f"differ in {axis}"
+    return "differ in batch size"
