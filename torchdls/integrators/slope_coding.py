@@ -108,15 +108,21 @@ class SlopeScale:
         total = self.fold(weight * estimate, slopes.shape)
         return Coded(total, self.fold(weight.expand_as(estimate), slopes.shape))
 
-    def code_atoms(self, slopes: Tensor, noise: Noise, tau: float, D: Tensor) -> tuple[Coded, Tensor, Tensor]:
-        """One sweep over codes and atoms of both components together, in units of the noise; returns D and B too."""
+    def code_atoms(
+        self, slopes: Tensor, noise: Noise, tau: float, D: Tensor, B: Tensor | None
+    ) -> tuple[Coded, Tensor, Tensor]:
+        """One sweep over codes and atoms of both components together, in units of the noise; returns D and B too.
+
+        The codes must go on from those of the last sweep (B None is a start from 0): learned atoms are not orthogonal,
+        and a start from 0 each time shrinks what they say together.
+        """
         level = self.level(noise).mean(1)
         P = self.extract(slopes)
         scale = torch.where(level > 0, level, 1)
         covariance = slope_covariance(self.size, slopes, self.steps)
         threshold = tau * ((covariance @ D.detach()) * D.detach()).sum(1).clamp(min=0).sqrt()
         threshold = torch.where(level[:, :, 0] > 0, threshold, 0)
-        B = P.new_zeros(P.shape[0], D.shape[-1], P.shape[-1])
+        B = P.new_zeros(P.shape[0], D.shape[-1], P.shape[-1]) if B is None else B / scale
         D, B = soup_dil_sweep(P.flatten(1, 2) / scale, D, B, threshold, order="block", unused="keep")
         B = B * scale
         return Coded(self.fold((D @ B).view_as(P), slopes.shape), self.coverage(slopes)), D, B

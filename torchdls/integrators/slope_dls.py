@@ -61,8 +61,8 @@ class SlopeDLS(Integrator):
        v' = (v + 25 u) / 26;
     4. gives back, in every band of frequencies, what was removed beyond the noise (`discrepancy_guard`).
 
-    The grid of the patches shifts from one iteration to the next. The number of iterations is early stopping and part
-    of the recipe.
+    The grid of the larger patches shifts from one iteration to the next; that of the smallest stays, and its codes go
+    on from those of the last sweep. The number of iterations is early stopping and part of the recipe.
 
     With a mask, slopes outside are filled by the last estimate u (at first by those of the harmonic extension).
     Weights are inverse relative variances: each patch is coded in units of its own noise. Step 4 then is left out for
@@ -190,11 +190,11 @@ class SlopeDLS(Integrator):
             slopes = extend_edges(a(z))
             slopes = slopes if valid is None else torch.where(valid, slopes, coded)
             parts = []
-            for k, scale in enumerate(s.shifted(iteration) for s in scales):
-                if k == 0 and D is not None:
-                    part, D, B = scale.code_atoms(slopes, noise, self.tau, D)
+            for k, scale in enumerate(scales):
+                if k == 0 and D is not None:  # on a grid at rest, where the codes of the last iteration still fit
+                    part, D, B = scale.code_atoms(slopes, noise, self.tau, D, B)
                 else:
-                    part = scale.code_cosines(slopes, noise, self.tau, self.aggregate)
+                    part = scale.shifted(iteration).code_cosines(slopes, noise, self.tau, self.aggregate)
                 parts.append(part)
             coded = average(parts)
             z = self._height(fields, (v + _KAPPA * coded) / (1 + _KAPPA), w, z)
