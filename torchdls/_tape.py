@@ -18,6 +18,14 @@ def recorded(*tensors: Tensor) -> bool:
     return any(torch._C._functorch.is_functorch_wrapped_tensor(t) for t in tensors)
 
 
+def taped(*tensors: Tensor) -> bool:
+    """True where plain autograd alone, in reverse mode, follows one of the tensors."""
+    transformed = any(torch._C._functorch.is_functorch_wrapped_tensor(t) for t in tensors)
+    if transformed or torch.compiler.is_compiling() or torch.autograd.forward_ad._current_level >= 0:
+        return False
+    return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+
+
 def visible(x: Tensor) -> bool:
     """Whether values can be looked at: not in a traced graph, nor inside vmap, however deep."""
     functorch = torch._C._functorch

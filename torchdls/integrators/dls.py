@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
@@ -9,11 +10,12 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchdls._tape import visible
+from torchdls._tape import taped, visible
 from torchdls.dictionary import dct_dictionary
 from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
 from torchdls.dictionary.thresholds import Threshold
 from torchdls.integrators.base import Fields, Integrator, edge_cost
+from torchdls.integrators.dls_checkpoint import checkpointed
 from torchdls.integrators.dls_checks import check_dictionary, check_size, parameter, per_surface
 from torchdls.integrators.dls_implicit import at_fixed_point
 from torchdls.integrators.dls_options import Grad, Learn, check_options, derivative, keep
@@ -106,7 +108,8 @@ class DLS(Integrator):
             "frozen_dictionary": the same as if the learned dictionary did not move, an approximation. "none". "auto" is
             "implicit" where that is exact and "unroll" elsewhere.
         grad_tol: relative residual of the linear solve of an implicit derivative.
-        checkpoint: save memory of an unrolled derivative by running each iteration again in the backward pass.
+        checkpoint: save memory of an unrolled derivative: only heights, dictionaries and nonzero codes are kept, and
+            each iteration is run again in the backward pass.
         pixel_size: (dx, dy) or one number; heights come out in its unit.
 
     Raises:
@@ -143,7 +146,7 @@ class DLS(Integrator):
         tol: float = 1e-3,
         z_tol: float = 1e-6,
         grad: Grad = "auto",
-        grad_tol: float = 1e-4,
+        grad_tol: float = 1e-3,
         checkpoint: bool = False,
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
@@ -233,12 +236,14 @@ class DLS(Integrator):
         look = self.tol > 0 and visible(model.fields.gradient)
         for iteration in range(1, self.n_iter + 1):
             index, old = parts[-1]
-            new = self._iterate(running, old, first=iteration == 1)
+            run = functools.partial(self._round, first=iteration == 1)
+            again = self.checkpoint and taped(old.z, old.D, running.lam, running.mu)
+            new, value = checkpointed(run, running, old) if again else run(running, old)
             settled = self._settled(new, old)
             if not look:  # every surface stays in the batch, and those that have settled do not move
                 new = old.choose(active, new) if self.tol > 0 else new
+                value = torch.where(active, value, objective[-1]) if self.tol > 0 else value
             parts[-1] = Part(index, new)
-            value = self._objective(running, new)
             objective.append(value if len(index) == len(active) else objective[-1].index_copy(0, index, value))
             if callback is not None:
                 callback(iteration, objective[-1].detach())
@@ -271,8 +276,13 @@ class DLS(Integrator):
         reach = model.patches.adjoint(live, z.shape) > 0
         return harmonic_extension(z, model.fields.mask, reach, tol=self.z_tol, pixel_size=model.fields.steps)
 
+    def _round(self, model: Model, state: State, first: bool) -> tuple[State, Tensor]:
+        """One iteration, and the objective after it."""
+        state = self._iterate(model, state, first)
+        return state, self._objective(model, state)
+
     def _iterate(self, model: Model, state: State, first: bool) -> State:
-        """One round: codes and atoms, then the height."""
+        """Codes and atoms, then the height."""
         R, D, B = state.R, state.D, state.B
         bare = torch.where(model.valid, R, 0) if first and model.valid is not None else None
         for _ in range(self.n_sweeps):

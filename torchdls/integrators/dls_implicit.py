@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchdls.dictionary.thresholds import Threshold
-from torchdls.integrators.dls_state import Model
+from torchdls.integrators.dls_state import Model, support
 from torchdls.operators import GradientOperator, Patches
 from torchdls.solvers import ConvergenceWarning, conjugate_gradients
 from torchdls.solvers.poisson import fold_vmap, preconditioner, present_edges
@@ -173,19 +173,20 @@ class _System(NamedTuple):
         """Codes b = D^T P z + f_b / 2 lam on the support: what is left is A^T w A + r + 2 lam fold(I - D S D^T) P."""
         strength = 2 * self.lam
         b0 = f_b / torch.where(strength > 0, strength, 1)
+        kept = self.free.mT.to(f_z.dtype).contiguous()  # patch by patch, as the patches lie in memory
 
         def apply(z: Tensor) -> Tensor:
-            X = self._extract(z)
-            codes = (self.D.mT @ X).mul_(self.free)
-            return self._data(z) + self._fold(torch.baddbmm(X, self.D, codes, alpha=-1))
+            X = self._extract(z).mT
+            X.baddbmm_((X @ self.D).mul_(kept), self.D.mT, alpha=-1)
+            return self._data(z) + self._fold(X.mT)
 
         z = self._cg(apply, self._loose(), f_z + self._fold(self.D @ b0))
-        return z, b0 + self.free * (self.D.mT @ self._extract(z))
+        return z, b0 + ((self._extract(z).mT @ self.D).mul_(kept)).mT
 
     def _joint(self, f_z: Tensor, f_b: Tensor) -> tuple[Tensor, Tensor]:
         """Unknowns z and the codes on the support, side by side; block elimination with D^T D = I preconditions."""
         h, wd = f_z.shape[-2:]
-        index, used = _support(self.free)
+        index, used = support(self.free)
         strength, loose = 2 * self.lam[..., 0], self._loose()
 
         def join(z: Tensor, codes: Tensor) -> Tensor:
@@ -240,14 +241,3 @@ class _System(NamedTuple):
 
 def _inside(X: Tensor, valid: Tensor | None) -> Tensor:
     return X if valid is None else torch.where(valid, X, 0)
-
-
-def _support(free: Tensor) -> tuple[Tensor, Tensor]:
-    """Flat positions (N, m) of the free codes of each surface, and which of the m places are used."""
-    flat = free.flatten(1)
-    count = flat.sum(1)
-    surface, position = flat.nonzero(as_tuple=True)
-    place = torch.arange(len(position), device=free.device) - (count.cumsum(0) - count)[surface]
-    index = torch.zeros(len(flat), max(int(count.max()), 1), dtype=torch.int64, device=free.device)
-    index[surface, place] = position
-    return index, torch.arange(index.shape[1], device=free.device) < count[:, None]

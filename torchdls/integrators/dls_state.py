@@ -97,3 +97,14 @@ def worthwhile(bare: Tensor, R: Tensor, B: Tensor, mu: Tensor, rule: Threshold) 
     cost = R.square().sum(1, keepdim=True) + penalty(B, mu[:, None, None], rule).sum(1, keepdim=True)
     pays = cost <= bare.square().sum(1, keepdim=True)
     return torch.where(pays, R, bare), torch.where(pays, B, 0)
+
+
+def support(free: Tensor) -> tuple[Tensor, Tensor]:
+    """Flat positions (N, m) of the free codes of each surface, and which of the m places are used."""
+    flat = free.flatten(1)
+    count = flat.sum(1)
+    surface, position = flat.nonzero(as_tuple=True)
+    place = torch.arange(len(position), device=free.device) - (count.cumsum(0) - count)[surface]
+    index = torch.zeros(len(flat), max(int(count.max()), 1), dtype=torch.int64, device=free.device)
+    index[surface, place] = position
+    return index, torch.arange(index.shape[1], device=free.device) < count[:, None]
