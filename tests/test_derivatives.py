@@ -13,7 +13,20 @@ from torch import Tensor
 
 import torchdls
 from tests.helpers import random_field
-from torchdls import DLS, INTEGRATORS, HornBrooks, Integrator, LeastSquares, SlopeDLS
+from torchdls import (
+    DLS,
+    INTEGRATORS,
+    L1,
+    HornBrooks,
+    Huber,
+    Integrator,
+    LeastSquares,
+    MEstimator,
+    MumfordShah,
+    SlopeDLS,
+    TotalVariation,
+    WeightedLeastSquares,
+)
 
 H, W = 6, 7  # a rectangle, neither side a multiple of the stride of DLS
 
@@ -28,6 +41,8 @@ def slope_dls(**options: Any) -> Callable[[], Integrator]:
     return lambda: SlopeDLS(**(settings | options))
 
 
+FEW = {"n_iter": 2, "tol": 0.0, "solve_tol": 1e-13}
+
 # What each method is built with: nothing, unless it stands here. More than one line tests more than one form.
 VARIANTS: dict[str, dict[str, Callable[[], Integrator]]] = {
     "least_squares": {
@@ -36,6 +51,15 @@ VARIANTS: dict[str, dict[str, Callable[[], Integrator]]] = {
         "dirichlet": lambda: LeastSquares(tol=1e-13, boundary="dirichlet"),
     },
     "horn_brooks": {"default": lambda: HornBrooks(relaxation=1.5)},
+    "weighted_least_squares": {"default": lambda: WeightedLeastSquares(floor=0.1, tol=1e-13)},
+    "total_variation": {"default": lambda: TotalVariation(**FEW)},
+    "l1": {"default": lambda: L1(**FEW)},
+    "huber": {"default": lambda: Huber(**FEW)},
+    "m_estimator": {
+        "default": lambda: MEstimator(floor=0.1, **FEW),
+        "tukey": lambda: MEstimator("tukey", floor=0.1, **FEW),
+    },
+    "mumford_shah": {"default": lambda: MumfordShah(floor=0.1, **FEW)},
     "dls": {
         "default": dls(),
         "block": dls(order="block", n_sweeps=2, bound=3.0),

@@ -23,17 +23,24 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.geometry import normals_to_gradient as normals_to_gradient
     from torchdls.integrators import DLS as DLS
     from torchdls.integrators import INTEGRATORS as INTEGRATORS
+    from torchdls.integrators import L1 as L1
     from torchdls.integrators import DLSResult as DLSResult
     from torchdls.integrators import FrankotChellappa as FrankotChellappa
     from torchdls.integrators import HarkerOLeary as HarkerOLeary
     from torchdls.integrators import HornBrooks as HornBrooks
+    from torchdls.integrators import Huber as Huber
     from torchdls.integrators import Integrator as Integrator
     from torchdls.integrators import LeastSquares as LeastSquares
     from torchdls.integrators import LineIntegral as LineIntegral
+    from torchdls.integrators import MEstimator as MEstimator
+    from torchdls.integrators import MumfordShah as MumfordShah
+    from torchdls.integrators import RobustResult as RobustResult
     from torchdls.integrators import SlopeDLS as SlopeDLS
     from torchdls.integrators import SlopeDLSResult as SlopeDLSResult
     from torchdls.integrators import SpectralRegularization as SpectralRegularization
     from torchdls.integrators import TikhonovRegularization as TikhonovRegularization
+    from torchdls.integrators import TotalVariation as TotalVariation
+    from torchdls.integrators import WeightedLeastSquares as WeightedLeastSquares
     from torchdls.integrators import dls_objective as dls_objective
     from torchdls.io import load_camera as load_camera
     from torchdls.io import load_field as load_field
@@ -89,6 +96,13 @@ _MODULE_OF = {
     "SpectralRegularization": "integrators",
     "TikhonovRegularization": "integrators",
     "dls_objective": "integrators",
+    "Huber": "integrators",
+    "L1": "integrators",
+    "MEstimator": "integrators",
+    "MumfordShah": "integrators",
+    "RobustResult": "integrators",
+    "TotalVariation": "integrators",
+    "WeightedLeastSquares": "integrators",
     # the parts they are made of
     "GradientOperator": "operators",
     "Patches": "operators",

@@ -56,6 +56,12 @@ INTEGRATORS = Registry(
         "harker_oleary": "HarkerOLeary",
         "spectral_regularization": "SpectralRegularization",
         "tikhonov_regularization": "TikhonovRegularization",
+        "weighted_least_squares": "WeightedLeastSquares",
+        "total_variation": "TotalVariation",
+        "l1": "L1",
+        "huber": "Huber",
+        "m_estimator": "MEstimator",
+        "mumford_shah": "MumfordShah",
         "dls": "DLS",
         "slope_dls": "SlopeDLS",
     }

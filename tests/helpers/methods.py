@@ -31,11 +31,19 @@ class Method:
         return INTEGRATORS[name](**{**self.options, **more})
 
 
+ONE_SCALE = {"components_are_independent": "one noise level is read from the whole surface"}
+
 METHODS: dict[str, Method] = {
     "least_squares": Method({"tol": 1e-12}),
     "frankot_chellappa": Method(no={"plane_is_exact": "a plane is not periodic"}),
     "horn_brooks": Method({"tol": 1e-5, "relaxation": 1.8}, tol=2e-3),
     "spectral_regularization": Method(no={"plane_is_exact": "a few cosines do not make a plane"}),
+    "weighted_least_squares": Method({"floor": 0.1}, tol=1e-4, no=ONE_SCALE),
+    "total_variation": Method({"n_iter": 10}, tol=1e-4, no=ONE_SCALE),
+    "l1": Method({"n_iter": 10}, tol=1e-4, no=ONE_SCALE),
+    "huber": Method({"n_iter": 10}, tol=1e-4, no=ONE_SCALE),
+    "m_estimator": Method({"n_iter": 5, "floor": 0.1}, tol=1e-3, no=ONE_SCALE),
+    "mumford_shah": Method({"n_iter": 5, "floor": 0.1}, tol=1e-3, no=ONE_SCALE),
     "dls": Method(
         {"patch_size": 4, "stride": 2, "n_atoms": 16, "mu": 0.3, "n_iter": 3, "tol": 0.0, "unused": "keep"},
         tol=1e-4,

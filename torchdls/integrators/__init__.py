@@ -8,10 +8,26 @@ from torchdls.integrators.fourier import FrankotChellappa
 from torchdls.integrators.horn_brooks import HornBrooks
 from torchdls.integrators.least_squares import LeastSquares
 from torchdls.integrators.line_integral import LineIntegral
+from torchdls.integrators.robust import (
+    L1,
+    Huber,
+    MEstimator,
+    MumfordShah,
+    RobustResult,
+    TotalVariation,
+    WeightedLeastSquares,
+)
 from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
 from torchdls.integrators.sylvester import HarkerOLeary, SpectralRegularization, TikhonovRegularization
 
 __all__ = [
+    "Huber",
+    "L1",
+    "MEstimator",
+    "MumfordShah",
+    "RobustResult",
+    "TotalVariation",
+    "WeightedLeastSquares",
     "DLS",
     "DLSResult",
     "Fields",

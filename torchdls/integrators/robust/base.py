@@ -1,0 +1,179 @@
+"""The loop that the robust methods share: around the solve (*), stopping each surface on its own objective."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from torchdls.integrators.base import Fields, Integrator
+from torchdls.operators import edge_slopes
+from torchdls.solvers import solve
+
+Callback = Callable[[int, Tensor], None]
+State = tuple[Tensor, ...]  # the height first, then whatever else an iteration hands to the next; all (N, ...)
+
+
+class RobustResult(NamedTuple):
+    """What `solve` of a robust integrator returns; always batched.
+
+    Attributes:
+        height: (N, 1, H, W).
+        objective: (N, iterations + 1), from the start on, for heights in pixels; constant once a surface has stopped.
+        iterations: (N,) the iterations each surface took.
+        converged: (N,) bool, whether it met `tol` within them.
+    """
+
+    height: Tensor
+    objective: Tensor
+    iterations: Tensor
+    converged: Tensor
+
+
+class DataTerm(Protocol):
+    """A data term bound to its fields, as a function of the height."""
+
+    def cost(self, z: Tensor) -> Tensor:
+        """(N,) its value at z."""
+
+    def majoriser(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Slopes v and trusts w (N, 2, H, W) of a quadratic that touches the data term at z and is nowhere below it.
+
+        The quadratic is 1/2 sum w (A . - v)^2, but for a constant.
+        """
+
+
+class Robust(Integrator):
+    """An integrator that repeats the solve (*) until its own objective settles, surface by surface.
+
+    A subclass provides its `data_term`. Its majoriser makes it a data term of DLS; solving for the minimum of the
+    majoriser again and again is also the default iteration (`_advance`), in which the objective never rises.
+
+    The derivative is that of the iterations run (unrolled, each solve by its implicit rule), in every input that is a
+    floating-point tensor; nothing is detached. The graph holds some fields per iteration.
+
+    Args:
+        n_iter: limit of iterations.
+        tol: a surface stops once an iteration changes its objective by less than `tol` of it; 0 runs all iterations.
+        solve_tol: relative residual of the solves.
+        pixel_size: (dx, dy) or one number; heights come out in its unit.
+    """
+
+    quadratic = True
+
+    def __init__(
+        self, *, n_iter: int, tol: float, solve_tol: float = 1e-6, pixel_size: float | Sequence[float] = 1.0
+    ) -> None:
+        super().__init__(pixel_size=pixel_size)
+        name = type(self).__name__
+        if not isinstance(n_iter, int) or n_iter < 0:
+            raise ValueError(f"{name}: n_iter={n_iter!r} given, an integer of at least 0 is needed")
+        if not tol >= 0 or not solve_tol > 0:
+            raise ValueError(f"{name}: tol={tol!r} must be at least 0, solve_tol={solve_tol!r} positive")
+        self.n_iter, self.tol, self.solve_tol = n_iter, tol, solve_tol
+
+    @abstractmethod
+    def data_term(self, fields: Fields) -> DataTerm:
+        """The data term of checked fields."""
+
+    def edges(self, fields: Fields, z: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+        """Slopes v and trusts w of the quadratic that majorises the data term around z (least squares for None)."""
+        if z is None:
+            return edge_slopes(fields.gradient, fields.mask, fields.weight)
+        return self.data_term(fields).majoriser(z)
+
+    def data_cost(self, fields: Fields, z: Tensor) -> Tensor:
+        """(N,) the data term at z, in pixels."""
+        return self.data_term(fields).cost(z)
+
+    def integrate(self, fields: Fields) -> Tensor:
+        """Height (N, 1, H, W) in pixels."""
+        return self._run(fields, None).height
+
+    def solve(
+        self,
+        gradient: Tensor,
+        mask: Tensor | None = None,
+        weight: Tensor | None = None,
+        anchor: Tensor | None = None,
+        anchor_weight: Tensor | float | None = None,
+        *,
+        callback: Callback | None = None,
+    ) -> RobustResult:
+        """Integrate as `forward` does, and tell how it went.
+
+        Args:
+            gradient: see `forward`, and so for the mask, weight and anchors; a single field is a batch of one.
+            mask: see `forward`.
+            weight: see `forward`.
+            anchor: see `forward`.
+            anchor_weight: see `forward`.
+            callback: called after each iteration as callback(iteration, objective (N,)), with iterations from 1.
+
+        Returns:
+            RobustResult(height, objective, iterations, converged).
+        """
+        result = self._run(self.check(gradient, mask, weight, anchor, anchor_weight), callback)
+        return result._replace(height=result.height * self.unit)
+
+    def _run(self, fields: Fields, callback: Callback | None) -> RobustResult:
+        data = self.data_term(fields)
+        state = self._begin(fields, data)
+        rounding = 10 * torch.finfo(state[0].dtype).eps * _objective(fields, data, torch.zeros_like(state[0])).detach()
+        objective = [_objective(fields, data, state[0])]
+        active = torch.ones_like(rounding, dtype=torch.bool)
+        iterations = torch.zeros_like(rounding, dtype=torch.int64)
+        for iteration in range(1, self.n_iter + 1):
+            ahead = self._advance(fields, data, state)
+            state = tuple(choose(active, new, old) for new, old in zip(ahead, state, strict=True))
+            objective.append(choose(active, _objective(fields, data, state[0]), objective[-1]))
+            iterations = iterations + active
+            if callback is not None:
+                callback(iteration, objective[-1].detach())
+            if self.tol > 0:
+                change = (objective[-1] - objective[-2]).abs() + self._gap(data, state)
+                active = active & (change > self.tol * objective[-1] + rounding)
+                if not bool(active.any()):
+                    break
+        return RobustResult(state[0], torch.stack(objective, 1), iterations, ~active)
+
+    def _begin(self, fields: Fields, data: DataTerm) -> State:
+        """Where to start: the least-squares surface."""
+        v, w = edge_slopes(fields.gradient, fields.mask, fields.weight)
+        return (self._surface(fields, v, w, fields.anchor_weight),)
+
+    def _advance(self, fields: Fields, data: DataTerm, state: State) -> State:
+        """One iteration: the minimum of the quadratic that majorises the objective around the height."""
+        v, w = data.majoriser(state[0])
+        return (self._surface(fields, v, w, fields.anchor_weight, state[0]),)
+
+    def _gap(self, data: DataTerm, state: State) -> Tensor | float:
+        """(N,) how far the cost at the height may be from what the iteration itself believes."""
+        return 0.0
+
+    def _surface(
+        self, fields: Fields, v: Tensor, w: Tensor | None, anchor_weight: Tensor | None, z0: Tensor | None = None
+    ) -> Tensor:
+        """The height that (*) gives for these slopes and trusts and the anchors of the fields."""
+        guess = None if z0 is None else z0.detach()
+        return solve(v, w, fields.anchor, anchor_weight, tol=self.solve_tol, z0=guess, pixel_size=fields.steps).height
+
+    def extra_repr(self) -> str:
+        """The settings, as `print` shows them."""
+        return f"n_iter={self.n_iter}, tol={self.tol:g}, pixel_size={self.pixel_size}"
+
+
+def choose(active: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """The new value where a surface is still active."""
+    return torch.where(active.view(-1, *[1] * (new.ndim - 1)), new, old)
+
+
+def _objective(fields: Fields, data: DataTerm, z: Tensor) -> Tensor:
+    """(N,) data term and anchors."""
+    cost = data.cost(z)
+    if fields.anchor is not None and fields.anchor_weight is not None:
+        cost = cost + 0.5 * (fields.anchor_weight * (z - fields.anchor).square()).sum((-3, -2, -1))
+    return cost
