@@ -69,6 +69,8 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.plot import hillshade as hillshade
     from torchdls.plot import page_html as page_html
     from torchdls.plot import surface_page as surface_page
+    from torchdls.selection import Selection as Selection
+    from torchdls.selection import select as select
     from torchdls.solvers import ConvergenceWarning as ConvergenceWarning
     from torchdls.solvers import SolveResult as SolveResult
     from torchdls.solvers import solve as solve
@@ -156,6 +158,8 @@ _MODULE_OF = {
     "rmse": "metrics",
     "ssim": "metrics",
     "noise_level": "noise",
+    "Selection": "selection",
+    "select": "selection",
 }
 
 __all__ = ["__version__", *_MODULE_OF]

@@ -7,13 +7,16 @@ independent normal errors of known variance (`torchdls.noise.height_noise`).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchdls.noise import height_noise
-from torchdls.operators import dct2, idct2
+from torchdls.noise import height_noise, noise_level
+from torchdls.operators import as_pixel_size, dct2, edge_slopes, idct2
 from torchdls.operators.tables import table
+from torchdls.solvers import solve
 
 _RATIO = 1.5  # of the frequencies that bound a band
 _SECTORS = 4  # directions into which a band is divided
@@ -117,3 +120,103 @@ def sure_guard(height: Tensor, reference: Tensor, change: Tensor, moved: Tensor,
     share = (-noise[:, None].square() * divergence / torch.where(some, energy, 1)).clamp(0, 1)
     share = torch.where(some, share, 1).index_fill(1, torch.zeros(1, dtype=torch.int64, device=band.device), 1.0)
     return reference + idct2(difference * share[:, band].view_as(height))
+
+
+class Selection(NamedTuple):
+    """What `select` chose.
+
+    Attributes:
+        height: (N, 1, H, W), in the unit of the pixel size.
+        choice: (N,) number of the candidate, -1 for least squares.
+        risk: (M, N) predicted squared error over that of least squares, both in the chosen norm; below 1 is better.
+    """
+
+    height: Tensor
+    choice: Tensor
+    risk: Tensor
+
+
+def select(
+    integrate: Callable[[Tensor], Tensor],
+    gradient: Tensor,
+    candidates: int,
+    *,
+    noise: Tensor | None = None,
+    criterion: Literal["sure", "r2r"] = "sure",
+    norm: float = 0.5,
+    least_cut: float = 0.2,
+    pixel_size: float | tuple[float, float] = 1.0,
+) -> Selection:
+    r"""Choose among candidates by their predicted risk, without the truth; least squares unless it is clearly beaten.
+
+        "sure":  risk = ||z - z_ls||^2 - N + 2 sigma^2 div,    div = <A^+ n, dz/dn>
+        "r2r":   risk = ||z(g + n'/2) - z_ls(g - 2 n')||^2 - 5 N,   n' fresh noise of the level of the data
+
+    in the norm sum_kl S_kl^(-norm) |C_kl|^2 over the cosine coefficients of the heights, with S the variance that
+    white noise leaves in them and N = sigma^2 sum S^(1 - norm) the risk of least squares. norm = 0 is the error of the
+    height, which a few low frequencies decide; norm = 1 weighs all coefficients by their own noise, much as slopes do.
+
+    Both are unbiased for normal noise (R2R: for data with a quarter more variance), and both scatter: a candidate
+    is taken only if it cuts the risk of least squares by more than `least_cut`.
+
+    Args:
+        integrate: (M N, 2, H, W) -> (M N, 1, H, W), candidate after candidate, each for all N surfaces; for instance
+            `lambda g: DLS(mu=factors.repeat_interleave(n) * sigma.repeat(m))(g)`. Called twice, or once for "r2r"
+            and once more for the result.
+        gradient: (N, 2, H, W), full rectangles with equal trust.
+        candidates: M.
+        noise: (N,) standard deviation of one gradient sample, None for `noise_level`.
+        criterion: "sure" or "r2r".
+        norm: 0, 1/2, 1 or any number between.
+        least_cut: the predicted cut of the risk of least squares from which a candidate is taken.
+        pixel_size: of the integrator.
+
+    Returns:
+        Selection(height, choice, risk). The random numbers have a fixed seed: two calls choose alike.
+
+    Raises:
+        ValueError: the criterion is unknown, or an argument does not fit.
+
+    Source: Stein (1981); Ramani, Blu, Unser (2008); Pang et al., "Recorrupted-to-Recorrupted", CVPR 2021.
+    """
+    if criterion not in ("sure", "r2r"):
+        raise ValueError(f"select: criterion={criterion!r} is unknown; choose from 'sure', 'r2r'")
+    if gradient.ndim != 4 or candidates < 1:
+        raise ValueError(f"select: gradient {tuple(gradient.shape)} and candidates={candidates} given; "
+                         "(N, 2, H, W) and at least one candidate are needed")  # fmt: skip
+    steps = as_pixel_size(pixel_size)
+    sigma = noise_level(gradient, pixel_size=steps) if noise is None else noise
+
+    def run(g: Tensor) -> Tensor:
+        return integrate(g.repeat(candidates, 1, 1, 1)).unflatten(0, (candidates, -1))
+
+    def least_squares(g: Tensor) -> Tensor:
+        return solve(edge_slopes(g)[0], pixel_size=steps).height
+
+    variance = height_noise((gradient.shape[-2], gradient.shape[-1]), gradient, steps)
+    weight = torch.where(variance > 0, variance.clamp(min=1e-30).pow(-norm), 0)
+    power = sigma.square()
+    base = power * (variance * weight).sum()
+
+    def energy(z: Tensor, other: Tensor) -> Tensor:
+        return (weight * dct2(z) * dct2(other)).sum((-3, -2, -1))
+
+    height, plain = run(gradient), least_squares(gradient)
+    if criterion == "sure":
+        n, step = probe(gradient, sigma)
+        change = (run(gradient + step * n) - height) / step
+        difference = height - plain
+        risk = energy(difference, difference) - base + 2 * power * energy(change, least_squares(n))
+    else:
+        generator = torch.Generator(device="cpu").manual_seed(0x5EED)  # unlike any seed that made the data
+        n = torch.randn(gradient.shape[1:], generator=generator, dtype=torch.float64, device="cpu").to(gradient)
+        n = n * sigma[:, None, None, None]
+        difference = run(gradient + 0.5 * n) - least_squares(gradient - 2 * n)
+        risk = energy(difference, difference) - 5 * base
+    risk = risk / torch.where(base > 0, base, 1)
+    least, best = risk.min(0)
+    taken = (least < 1 - least_cut) & (base > 0)
+    chosen = height[best, torch.arange(len(best), device=best.device)]
+    return Selection(
+        torch.where(taken[:, None, None, None], chosen, plain), torch.where(taken, best, -1), risk.detach()
+    )
