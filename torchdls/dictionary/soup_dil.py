@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
 from typing import Literal, NamedTuple
 
@@ -89,16 +89,18 @@ def residual_sweep(
     unused: Unused = "first",
     learn: bool = True,
     threshold: Threshold = "hard",
+    project: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`soup_dil_sweep` for a caller who keeps the residual R = P - D B (N, n, L) instead of the patches.
 
-    It is fastest where each patch of R is contiguous, as `Patches.extract` has it.
+    It is fastest where each patch of R is contiguous, as `Patches.extract` has it. `project` brings an atom h (N, n, 1)
+    into the set that atoms are chosen from, before it is normalised.
 
     Returns:
         R, D and B after the sweep. Where no derivative is recorded, R and B are overwritten: no second copy is made.
     """
     in_place = not recorded(R, D, B, *([mu] if isinstance(mu, Tensor) else []))
-    rule = _Rule(_levels(mu, B, in_place), bound, threshold, unused, in_place)
+    rule = _Rule(_levels(mu, B, in_place), bound, threshold, unused, in_place, project)
     if not in_place or R.shape[-1] < _SHORTEST or (learn and D.shape[0] < R.shape[0]):
         return _sweep(R, D, B, rule, order, learn)
     # Large surfaces one by one: each has thresholds that are numbers, and zeros that can be skipped.
@@ -121,6 +123,10 @@ class _Rule(NamedTuple):
     threshold: Threshold
     unused: Unused
     in_place: bool
+    project: Callable[[Tensor], Tensor] | None = None
+
+    def unit(self, h: Tensor) -> Tensor:
+        return _normalize(h if self.project is None else self.project(h))
 
     def of_surface(self, i: int) -> _Rule:
         """The rule for one surface of the batch, whose thresholds are numbers."""
@@ -190,7 +196,7 @@ def _update_atoms(H: Tensor, C: Tensor, D: Tensor, rule: _Rule) -> Tensor:
     rest = H + D * C.diagonal(dim1=-2, dim2=-1)[:, None]
     atoms = []
     for i in range(D.shape[-1]):
-        atom = _normalize(rest[..., :1])
+        atom = rule.unit(rest[..., :1])
         step = atom - D[..., i : i + 1]
         rest = rule.add_product(rest[..., 1:], step, C[:, i : i + 1, i + 1 :], -1)
         atoms.append(atom)
@@ -210,7 +216,7 @@ def _atom_order(R: Tensor, D: Tensor, B: Tensor, rule: _Rule) -> tuple[Tensor, T
             d, b = D0[..., k : k + 1], B0[:, k : k + 1]
             row = rule.shrink(rest[:, :1], start + k)
             h = _times_sparse(R, row, rule.in_place) - C @ (S @ row.mT) + d * (b @ row.mT)
-            atom = _where_used(_normalize(h.sum(0, keepdim=True) if shared else h), d, rule.unused)
+            atom = _where_used(rule.unit(h.sum(0, keepdim=True) if shared else h), d, rule.unused)
             pair, change = torch.cat([atom, -d], -1), torch.cat([row, b], 1)
             rest = rule.add_product(rest[:, 1:], D0[..., k + 1 :].mT @ pair, change, -1)
             C, S = torch.cat([C, pair], -1), torch.cat([S, change], 1)

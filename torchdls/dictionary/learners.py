@@ -1,0 +1,209 @@
+r"""Dictionary learners behind one interface: each call is one pass over codes and atoms that never raises the cost.
+
+    ||P - D B||_F^2 + mu^2 ||B||_0,   ||d_i|| = 1,   |b_ji| <= bound
+
+A learner is called as learner(R, D, B, mu, bound=inf, learn=True) -> (R, D, B), with the residual R = P - D B (N, n, L),
+the dictionary D (N, n, K), or (1, n, K) shared by the batch, the codes B (N, K, L) and the threshold mu, a number or (N,
+1). `learn=False` updates the codes alone. R and B may be overwritten where no derivative is recorded.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
+from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
+from torchdls.dictionary.thresholds import Threshold
+
+Step = tuple[Tensor, Tensor, Tensor]
+
+
+class Learner(Protocol):
+    """What DLS asks of a learner; see the module."""
+
+    def __call__(
+        self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
+    ) -> Step:
+        """One pass: R, D and B after it."""
+
+
+@dataclass(frozen=True)
+class SoupDIL:
+    """Sum of outer products: each row of codes by thresholding, each atom by one product (see `soup_dil_sweep`).
+
+    Args:
+        order: "atom" (the paper's) or "block".
+        unused: rule for atoms that no patch uses, "first" or "keep".
+        threshold: "hard", "soft" or "firm".
+
+    Source: Ravishankar, Nadakuditi, Fessler, "Efficient sum of outer products dictionary learning (SOUP-DIL)", 2015.
+    """
+
+    order: Order = "atom"
+    unused: Unused = "first"
+    threshold: Threshold = "hard"
+
+    def __call__(
+        self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
+    ) -> Step:
+        """One sweep."""
+        return residual_sweep(
+            R, D, B, mu, bound, self.order, unused=self.unused, learn=learn, threshold=self.threshold
+        )
+
+
+@dataclass(frozen=True)
+class FixedDictionary:
+    """The dictionary stays as it is (the cosine one, by default in DLS); only the codes follow, by thresholding.
+
+    Exact for orthonormal dictionaries; for others one pass of coordinate descent over the rows of codes.
+    """
+
+    def __call__(
+        self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
+    ) -> Step:
+        """One pass over the codes, whatever `learn` says."""
+        return residual_sweep(R, D, B, mu, bound, "block", learn=False)
+
+
+@dataclass(frozen=True)
+class DinoKat:
+    """SOUP-DIL with low-rank atoms: as a c_y x c_x matrix, every atom has at most the given rank.
+
+    The best such atom is the product h of the sweep, cut to its largest singular values and normalised. A learned atom
+    has fewer parameters, so less noise enters it. Start from atoms of that rank, as the cosine ones are. Differentiable
+    where the singular values of h differ.
+
+    Args:
+        rank: of the atoms, at least 1.
+        patch_size: rows and columns (c_y, c_x) of a patch; None for square patches.
+        order: "atom" or "block".
+        unused: rule for atoms that no patch uses, "first" or "keep".
+
+    Source: Ravishankar, Moore, Nadakuditi, Fessler, "Efficient learning of dictionaries with low-rank atoms", 2016.
+    """
+
+    rank: int = 1
+    patch_size: tuple[int, int] | None = None
+    order: Order = "atom"
+    unused: Unused = "first"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.rank, int) or self.rank < 1:
+            raise ValueError(f"DinoKat: rank={self.rank!r} given, an integer of at least 1 is needed")
+
+    def __call__(
+        self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
+    ) -> Step:
+        """One sweep."""
+        return residual_sweep(R, D, B, mu, bound, self.order, unused=self.unused, learn=learn, project=self.project)
+
+    def project(self, h: Tensor) -> Tensor:
+        """(N, n, 1), each of them cut to its largest singular values as a c_y x c_x matrix."""
+        n = h.shape[1]
+        side = math.isqrt(n)
+        shape = (side, side) if self.patch_size is None else self.patch_size
+        if shape[0] * shape[1] != n:
+            raise ValueError(f"DinoKat: patch_size={self.patch_size!r} does not fit patches of {n} pixels")
+        matrices = h[..., 0].unflatten(-1, shape)
+        some = (matrices != 0).flatten(1).any(1)[:, None, None]
+        # What stands in for 0 has singular values that differ: their derivative is finite, and goes nowhere.
+        ladder = torch.diag(torch.arange(1, max(shape) + 1, dtype=h.dtype, device=h.device))[: shape[0], : shape[1]]
+        u, s, v = torch.linalg.svd(torch.where(some, matrices, ladder), full_matrices=False)
+        cut = (u[..., : self.rank] * s[..., None, : self.rank]) @ v[..., : self.rank, :]
+        return torch.where(some, cut, 0).flatten(1)[..., None]
+
+
+@dataclass(frozen=True)
+class KSVD:
+    """K-SVD: codes by orthogonal matching pursuit, then each atom together with the codes that use it.
+
+    A patch keeps its old codes where they cost less than the new ones. An atom and its codes are the largest singular
+    pair of the residual of its patches, found by `steps` alternating products (one is the usual approximation). Atoms
+    that no patch uses become the patches that are fitted worst. Not for `torch.compile` or `vmap`: the pursuit works on
+    the patches that are not yet done.
+
+    Args:
+        n_nonzero: most atoms of a patch; None leaves it to mu.
+        steps: alternating products per atom, at least 1.
+
+    Source: Aharon, Elad, Bruckstein, "K-SVD: an algorithm for designing overcomplete dictionaries for sparse
+    representation", 2006; Rubinstein, Zibulevsky, Elad, 2008.
+    """
+
+    n_nonzero: int | None = None
+    steps: int = 1
+
+    def __post_init__(self) -> None:
+        for name, value in (("n_nonzero", self.n_nonzero or 1), ("steps", self.steps)):
+            if not isinstance(value, int) or value < 1:
+                raise ValueError(f"KSVD: {name}={value!r} given, an integer of at least 1 is needed")
+
+    def __call__(
+        self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
+    ) -> Step:
+        """One pass: pursuit, then atoms."""
+        N, _, L = R.shape
+        level = torch.as_tensor(mu, dtype=R.dtype, device=R.device).reshape(-1, 1).expand(N, L)
+        P = R + D @ B
+        found = orthogonal_matching_pursuit(P, D, self.n_nonzero, mu=level).clamp(-bound, bound)
+        rest = P - D @ found
+        better = (_cost(rest, found, level) < _cost(R, B, level))[:, None]
+        R, B = torch.where(better, rest, R), torch.where(better, found, B)
+        if not learn:
+            return R, D, B
+        if D.shape[0] == N:
+            return self._atoms(R, D, B, bound)
+        # One dictionary for all: the patches of the batch side by side are the patches of one surface.
+        R, D, B = self._atoms(R.transpose(0, 1).flatten(1)[None], D, B.transpose(0, 1).flatten(1)[None], bound)
+        return R[0].unflatten(1, (N, L)).transpose(0, 1), D, B[0].unflatten(1, (N, L)).transpose(0, 1)
+
+    def _atoms(self, R: Tensor, D: Tensor, B: Tensor, bound: float) -> Step:
+        atoms, rows = [], []
+        for d, b in zip(D.split(1, -1), B.split(1, 1), strict=True):
+            users = b != 0
+            E = torch.where(users, R + d @ b, 0)
+            old = d @ b
+            for _ in range(self.steps):
+                d = _unit(E @ b.mT, d)
+                b = torch.where(users, (d.mT @ E).clamp(-bound, bound), 0)
+            R = R + old - d @ b
+            atoms.append(d)
+            rows.append(b)
+        B = torch.cat(rows, 1)
+        return R, _replace_unused(torch.cat(atoms, -1), R, B), B
+
+
+def _cost(R: Tensor, B: Tensor, level: Tensor) -> Tensor:
+    """(N, L) cost of each patch."""
+    return R.square().sum(1) + level.square() * (B != 0).sum(1)
+
+
+def _unit(h: Tensor, instead: Tensor) -> Tensor:
+    """h / ||h||, or what stands in for h = 0."""
+    square = h.square().sum(1, keepdim=True)
+    return torch.where(square > 0, h * torch.where(square > 0, square, 1).rsqrt(), instead)
+
+
+def _replace_unused(D: Tensor, R: Tensor, B: Tensor) -> Tensor:
+    """Unused atoms become the residuals of the patches fitted worst, the first of them that of the worst."""
+    unused = ~(B != 0).any(2)
+    count = min(D.shape[-1], R.shape[-1])
+    worst = R.square().sum(1).topk(count, -1).indices
+    rank = (unused.cumsum(1) - 1).clamp(0, count - 1)
+    patches = R.gather(2, worst.gather(1, rank)[:, None].expand(-1, R.shape[1], -1))
+    return torch.where(unused[:, None], _unit(patches, D), D)
+
+
+LEARNERS: dict[str, type[SoupDIL] | type[FixedDictionary] | type[DinoKat] | type[KSVD]] = {
+    "soup_dil": SoupDIL,
+    "k_svd": KSVD,
+    "fixed": FixedDictionary,
+    "dino_kat": DinoKat,
+}
+"""The learners by name."""
