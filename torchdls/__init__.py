@@ -8,7 +8,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal to the table below
+    from torchdls.dictionary import KSVD as KSVD
+    from torchdls.dictionary import LEARNERS as LEARNERS
+    from torchdls.dictionary import DinoKat as DinoKat
+    from torchdls.dictionary import FixedDictionary as FixedDictionary
+    from torchdls.dictionary import Learner as Learner
+    from torchdls.dictionary import SoupDIL as SoupDIL
     from torchdls.dictionary import dct_dictionary as dct_dictionary
+    from torchdls.dictionary import orthogonal_matching_pursuit as orthogonal_matching_pursuit
     from torchdls.dictionary import soup_dil_sweep as soup_dil_sweep
     from torchdls.geometry import GradientField as GradientField
     from torchdls.geometry import GradientToNormals as GradientToNormals
@@ -115,6 +122,13 @@ _MODULE_OF = {
     "SolveResult": "solvers",
     "solve": "solvers",
     "dct_dictionary": "dictionary",
+    "KSVD": "dictionary",
+    "LEARNERS": "dictionary",
+    "DinoKat": "dictionary",
+    "FixedDictionary": "dictionary",
+    "Learner": "dictionary",
+    "SoupDIL": "dictionary",
+    "orthogonal_matching_pursuit": "dictionary",
     "soup_dil_sweep": "dictionary",
     # normals, gradients, cameras
     "GradientField": "geometry",

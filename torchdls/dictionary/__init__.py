@@ -1,6 +1,18 @@
-"""Dictionaries of patches: initial dictionaries and the SOUP-DIL sweep that learns them."""
+"""Dictionaries of patches: initial dictionaries, sparse coding, and the learners (SOUP-DIL first among them)."""
 
 from torchdls.dictionary.initial import dct_dictionary
+from torchdls.dictionary.learners import KSVD, LEARNERS, DinoKat, FixedDictionary, Learner, SoupDIL
+from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import soup_dil_sweep
 
-__all__ = ["dct_dictionary", "soup_dil_sweep"]
+__all__ = [
+    "KSVD",
+    "LEARNERS",
+    "DinoKat",
+    "FixedDictionary",
+    "Learner",
+    "SoupDIL",
+    "dct_dictionary",
+    "orthogonal_matching_pursuit",
+    "soup_dil_sweep",
+]

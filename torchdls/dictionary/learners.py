@@ -2,9 +2,9 @@ r"""Dictionary learners behind one interface: each call is one pass over codes a
 
     ||P - D B||_F^2 + mu^2 ||B||_0,   ||d_i|| = 1,   |b_ji| <= bound
 
-A learner is called as learner(R, D, B, mu, bound=inf, learn=True) -> (R, D, B), with the residual R = P - D B (N, n, L),
-the dictionary D (N, n, K), or (1, n, K) shared by the batch, the codes B (N, K, L) and the threshold mu, a number or (N,
-1). `learn=False` updates the codes alone. R and B may be overwritten where no derivative is recorded.
+A learner is called as learner(R, D, B, mu, bound=inf, learn=True) -> (R, D, B), with the residual R = P - D B
+(N, n, L), the dictionary D (N, n, K), or (1, n, K) shared by the batch, the codes B (N, K, L) and the threshold mu, a
+number or (N, 1). `learn=False` updates the codes alone. R and B may be overwritten where no derivative is recorded.
 """
 
 from __future__ import annotations
@@ -52,9 +52,7 @@ class SoupDIL:
         self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
     ) -> Step:
         """One sweep."""
-        return residual_sweep(
-            R, D, B, mu, bound, self.order, unused=self.unused, learn=learn, threshold=self.threshold
-        )
+        return residual_sweep(R, D, B, mu, bound, self.order, unused=self.unused, learn=learn, threshold=self.threshold)
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ def orthogonal_matching_pursuit(
     r"""Codes B (N, K, L) of patches, one atom at a time.
 
     Each patch p takes the atom of largest |d_i^T r|, with r its residual, and fits all atoms it has taken by least
-    squares. It stops with `n_nonzero` atoms, at |r|^2 <= tol, or when no |d_i^T r| exceeds mu: an atom lowers |r|^2 by at
-    least (d_i^T r)^2, so that each step lowers |r|^2 + mu^2 ||b||_0. Differentiable, with the support of B frozen.
+    squares. It stops with `n_nonzero` atoms, at |r|^2 <= tol, or when no |d_i^T r| exceeds mu: an atom lowers |r|^2 by
+    at least (d_i^T r)^2, so that each step lowers |r|^2 + mu^2 ||b||_0. Differentiable, with the support of B frozen.
 
     Args:
         P: (N, n, L) patches.
@@ -67,7 +67,8 @@ def _pursue(P: Tensor, D: Tensor, limit: int, least: Tensor, enough: Tensor) -> 
         x = torch.linalg.solve(inner, target)
         correlation = start[rows] - (x[:, None] @ gram[atoms])[:, 0]
         left = energy[rows] - (x * target).sum(1)
-    done.append((rows, atoms, x))
+    else:
+        done.append((rows, atoms, x))
     codes = torch.zeros_like(start)
     for rows, atoms, x in done:
         codes = codes.index_put((rows[:, None].expand_as(atoms), atoms), x)

@@ -12,13 +12,14 @@ from torch import Tensor
 
 from torchdls._tape import taped, visible
 from torchdls.dictionary import dct_dictionary
-from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
+from torchdls.dictionary.learners import FixedDictionary, Learner
+from torchdls.dictionary.soup_dil import Order, Unused
 from torchdls.dictionary.thresholds import Threshold
 from torchdls.integrators.base import Fields, Integrator, edge_cost
 from torchdls.integrators.dls_checkpoint import checkpointed
 from torchdls.integrators.dls_checks import check_dictionary, check_size, parameter, per_surface
 from torchdls.integrators.dls_implicit import at_fixed_point
-from torchdls.integrators.dls_options import Grad, Learn, check_options, derivative, keep
+from torchdls.integrators.dls_options import Grad, Learn, check_options, choose_learner, derivative, keep
 from torchdls.integrators.dls_state import Model, Part, State, merge, patch_cost, worthwhile
 from torchdls.integrators.least_squares import LeastSquares
 from torchdls.integrators.window import live_window
@@ -98,6 +99,8 @@ class DLS(Integrator):
         n_prox: proximal gradient steps per iteration.
         bound: bound a on the codes, for heights in pixels.
         unused: rule for atoms that no patch uses, "first" or "keep" (see `soup_dil_sweep`).
+        learner: "soup_dil", "k_svd", "dino_kat", "fixed", or a `Learner` such as `KSVD(n_nonzero=4)`; None is
+            `SoupDIL(order, unused, threshold)`.
         tol: a surface stops once a step moves its height by less than `tol` times the whole way from the first height;
             0 runs all iterations.
         threshold: "hard" (the paper's), or "soft" or "firm" (see `torchdls.dictionary.thresholds`), with which `mu` can
@@ -142,6 +145,7 @@ class DLS(Integrator):
         n_prox: int = 1,
         bound: float = math.inf,
         unused: Unused = "first",
+        learner: str | Learner | None = None,
         threshold: Threshold = "hard",
         tol: float = 1e-3,
         z_tol: float = 1e-6,
@@ -157,6 +161,7 @@ class DLS(Integrator):
             raise TypeError(f"DLS: data_term is a {type(data_term).__name__}, an Integrator is needed")
         if not self.data_term.quadratic:
             raise ValueError(f"DLS: data_term {type(data_term).__name__} is not built on the weighted solve")
+        learn = "fixed" if learner == "fixed" or isinstance(learner, FixedDictionary) else learn
         options = {"z_step": z_step, "order": order, "learn": learn, "unused": unused, "threshold": threshold}
         counts = {"n_iter": n_iter, "n_sweeps": n_sweeps, "n_prox": n_prox}
         check_options(**options, **counts, grad=grad, bound=bound, tol=tol, z_tol=z_tol, grad_tol=grad_tol)
@@ -165,6 +170,7 @@ class DLS(Integrator):
         self.n_iter, self.n_sweeps, self.n_prox = n_iter, n_sweeps, n_prox
         self.z_step, self.order, self.learn, self.unused, self.threshold = z_step, order, learn, unused, threshold
         self.bound, self.tol, self.z_tol, self.grad_tol = bound, tol, z_tol, grad_tol
+        self.learner = choose_learner(learner, order, unused, threshold)
         self.checkpoint = checkpoint
         initial = dct_dictionary(self.patches.size, n_atoms) if dictionary is None else dictionary
         check_dictionary(initial, self.patches)
@@ -286,17 +292,7 @@ class DLS(Integrator):
         R, D, B = state.R, state.D, state.B
         bare = torch.where(model.valid, R, 0) if first and model.valid is not None else None
         for _ in range(self.n_sweeps):
-            R, D, B = residual_sweep(
-                R,
-                D,
-                B,
-                model.mu[:, None],
-                self.bound,
-                self.order,
-                unused=self.unused,
-                learn=self.learn != "fixed",
-                threshold=self.threshold,
-            )
+            R, D, B = self.learner(R, D, B, model.mu[:, None], self.bound, self.learn != "fixed")
             # Filling the invalid pixels of a patch by its approximation D b means: no residual there.
             R = R if model.valid is None else torch.where(model.valid, R, 0)
             if bare is not None:
@@ -383,5 +379,5 @@ class DLS(Integrator):
 
     def extra_repr(self) -> str:
         """The settings, as `print` shows them."""
-        names = ("lam", "mu", "n_iter", "z_step", "order", "learn", "threshold", "grad", "tol", "pixel_size")
+        names = ("lam", "mu", "n_iter", "z_step", "learner", "learn", "threshold", "grad", "tol", "pixel_size")
         return f"{self.patches}, " + ", ".join(f"{n}={getattr(self, n)!r}" for n in names)

@@ -6,7 +6,9 @@ from typing import Any, Literal
 
 from torch import Tensor, nn
 
-from torchdls.dictionary.thresholds import THRESHOLDS
+from torchdls.dictionary.learners import LEARNERS, Learner, SoupDIL
+from torchdls.dictionary.soup_dil import Order, Unused
+from torchdls.dictionary.thresholds import THRESHOLDS, Threshold
 
 Learn = Literal["each", "shared", "fixed"]
 Grad = Literal["auto", "unroll", "implicit", "frozen_dictionary", "none"]
@@ -58,6 +60,21 @@ def derivative(grad: Grad, learn: Learn, threshold: str, steady: bool, dictionar
         if grad == "frozen_dictionary" and isinstance(dictionary, nn.Parameter):
             raise ValueError("DLS: grad='frozen_dictionary' gives a trained dictionary no derivative; take 'unroll'")
     return grad
+
+
+def choose_learner(learner: str | Learner | None, order: Order, unused: Unused, threshold: Threshold) -> Learner:
+    """The learner of that name, or the one given; None is SOUP-DIL with the other options."""
+    if learner is None or learner == "soup_dil":
+        return SoupDIL(order, unused, threshold)
+    if isinstance(learner, str):
+        if learner not in LEARNERS:
+            raise ValueError(f"DLS: learner={learner!r} is unknown; choose from {', '.join(map(repr, LEARNERS))}")
+        learner = LEARNERS[learner]()
+    if not callable(learner):
+        raise TypeError(f"DLS: learner is a {type(learner).__name__}, a name or a Learner is needed")
+    if getattr(learner, "threshold", "hard") != threshold:
+        raise ValueError(f"DLS: threshold={threshold!r} does not go with learner={learner!r}")
+    return learner
 
 
 def keep(module: nn.Module, name: str, value: float | Tensor | str) -> None:

@@ -1,0 +1,236 @@
+"""The dictionary learners: descent, planted dictionaries, K-SVD's pursuit against scikit-learn's, and each in DLS."""
+
+import numpy as np
+import pytest
+import torch
+
+import torchdls
+from tests.helpers import DISK, assert_gradients, assert_unchanged, random_field, seeded
+from torchdls import DLS, KSVD, LEARNERS, SURFACES, DinoKat, FixedDictionary, SoupDIL, orthogonal_matching_pursuit
+
+F64 = torch.float64
+
+
+def unit(d):
+    return d / d.norm(dim=-2, keepdim=True)
+
+
+def low_rank_atoms(rows, columns, count, seed):
+    left, right = random_field(rows, count, seed=seed), random_field(columns, count, seed=seed + 1)
+    return unit(torch.einsum("ik,jk->ijk", left, right).flatten(0, 1))
+
+
+def planted(atoms, L, nonzeros, snr_db, seed=0):
+    """Patches (1, n, L) of a few atoms each, with codes of size 1 to 2 and noise."""
+    K = atoms.shape[1]
+    support = torch.rand(K, L, generator=seeded(seed)).argsort(0) < nonzeros
+    size = 1 + torch.rand(K, L, generator=seeded(seed + 1), dtype=F64)
+    clean = atoms @ (support * size * random_field(K, L, seed=seed + 2).sign())
+    noise = random_field(*clean.shape, seed=seed + 3)
+    return (clean + noise * clean.norm() / noise.norm() * 10 ** (-snr_db / 20))[None]
+
+
+def recovered(D, atoms):
+    """Part of the planted atoms that D holds, up to the sign: |<d, atom>| > .99."""
+    return ((D[0].mT @ atoms).abs().amax(0) > 0.99).double().mean().item()
+
+
+def cost(R, B, mu):
+    return R.square().sum((1, 2)) + mu**2 * (B != 0).sum((1, 2))
+
+
+def start(P, D):
+    return P.clone(), D.clone(), P.new_zeros(len(P), D.shape[-1], P.shape[-1])
+
+
+# ---- orthogonal matching pursuit
+
+
+@pytest.mark.parametrize("n_nonzero", [1, 3, 7])
+def test_pursuit_equals_scikit_learn(n_nonzero):
+    from sklearn.linear_model import orthogonal_mp
+
+    D, P = unit(random_field(16, 32, seed=1)), random_field(16, 60, seed=2)
+    ours = orthogonal_matching_pursuit(P[None], D[None], n_nonzero)[0]
+    theirs = orthogonal_mp(D.numpy(), P.numpy(), n_nonzero_coefs=n_nonzero)
+    np.testing.assert_allclose(ours, theirs, atol=1e-10)
+
+
+def test_pursuit_to_a_residual_equals_scikit_learn():
+    from sklearn.linear_model import orthogonal_mp
+
+    D, P = unit(random_field(16, 32, seed=3)), random_field(16, 40, seed=4)
+    ours = orthogonal_matching_pursuit(P[None], D[None], tol=2.0)[0]
+    theirs = np.stack([orthogonal_mp(D.numpy(), p, tol=2.0) for p in P.mT.numpy()], 1)
+    np.testing.assert_allclose(ours, theirs, atol=1e-10)
+    assert len(set((ours != 0).sum(0).tolist())) > 2  # patches stop at different times
+
+
+def test_pursuit_stops_at_the_threshold_and_lowers_the_cost_at_every_atom():
+    D, P = unit(random_field(1, 16, 32, seed=5)), random_field(1, 16, 50, seed=6)
+    before = torch.full((1,), torch.inf, dtype=F64)
+    for n in range(1, 12):
+        B = orthogonal_matching_pursuit(P, D, n, mu=0.6)
+        now = cost(P - D @ B, B, 0.6)
+        assert now <= before + 1e-9
+        before = now
+    assert (D.mT @ (P - D @ orthogonal_matching_pursuit(P, D, mu=0.6))).abs().max() <= 0.6
+    assert (orthogonal_matching_pursuit(P, D, mu=torch.tensor([[np.inf]])) == 0).all()
+
+
+def test_pursuit_batches_and_derivatives():
+    D, P = unit(random_field(2, 9, 12, seed=7)), random_field(2, 9, 5, seed=8)
+    both = orthogonal_matching_pursuit(P, D, 3)
+    torch.testing.assert_close(both[1:], orthogonal_matching_pursuit(P[1:], D[1:], 3))
+    assert_gradients(lambda p, d: orthogonal_matching_pursuit(p, d, 2), P[:1, :4, :3], unit(D[:1, :4, :5]))
+    exact = orthogonal_matching_pursuit(P, torch.eye(9, dtype=F64)[None])  # every atom is taken
+    torch.testing.assert_close(exact, P)
+    assert (orthogonal_matching_pursuit(0 * P, D) == 0).all()
+    with pytest.raises(ValueError, match="do not fit"):
+        orthogonal_matching_pursuit(P, D[:, :4])
+    with pytest.raises(ValueError, match="n_nonzero: 0"):
+        orthogonal_matching_pursuit(P, D, 0)
+
+
+# ---- the interface
+
+
+ALL = [SoupDIL(), SoupDIL("block", "keep"), KSVD(), KSVD(n_nonzero=3, steps=3), FixedDictionary(), DinoKat(),
+       DinoKat(2, (3, 4), "block")]  # fmt: skip
+
+
+@pytest.mark.parametrize("learner", ALL, ids=repr)
+@pytest.mark.parametrize("shared", [False, True])
+def test_no_pass_raises_the_cost(learner, shared):
+    square = isinstance(learner, DinoKat) and learner.patch_size is None
+    P = random_field(2, 9 if square else 12, 80)
+    atoms = low_rank_atoms(3, 3 if square else 4, 14, 2)[None]
+    D = atoms.expand(1 if shared else 2, -1, -1)
+    R, D, B = start(P, D)
+    mu = torch.tensor([[0.8], [1.1]], dtype=F64)
+    before = cost(R, B, mu[:, 0])
+    for _ in range(6):
+        R, D, B = learner(R, D, B, mu, 2.5)
+        now = cost(R, B, mu[:, 0])
+        assert now.sum() <= before.sum() + 1e-9
+        assert shared or (now <= before + 1e-9).all()
+        before = now
+        torch.testing.assert_close(R, P - D @ B)
+        torch.testing.assert_close(D.norm(dim=1), torch.ones_like(D[:, 0]))
+        assert B.abs().max() <= 2.5 + 1e-12
+    assert (B != 0).any()
+    if not shared:
+        alone = start(P[1:], atoms)
+        for _ in range(6):
+            alone = learner(*alone, mu[1:], 2.5)
+        torch.testing.assert_close(alone[2], B[1:], atol=1e-8, rtol=1e-8)
+
+
+@pytest.mark.parametrize("learner", ALL[:5], ids=repr)
+def test_learn_false_keeps_the_dictionary(learner):
+    P, D = random_field(1, 9, 30), unit(random_field(1, 9, 12, seed=2))
+    with assert_unchanged(D):
+        R, kept, B = learner(*start(P, D), 0.7, learn=False)
+    assert torch.equal(kept, D)
+    torch.testing.assert_close(R, P - D @ B)
+
+
+@pytest.mark.parametrize("learner", [SoupDIL(), KSVD(), KSVD(n_nonzero=2), DinoKat(), DinoKat(2)], ids=repr)
+def test_derivatives_of_a_pass(learner):
+    P, D = random_field(1, 4, 6), low_rank_atoms(2, 2, 3, 2)[None]
+
+    def run(p, d):
+        return torch.cat([t.flatten() for t in learner(*learner(p.clone(), d, p.new_zeros(1, 3, 6), 0.7), 0.7)])
+
+    assert_gradients(run, P, D)
+
+
+def test_low_rank_atoms_are_the_best_ones():
+    P, D = random_field(1, 12, 50), unit(random_field(1, 12, 1, seed=2))
+    R, found, B = DinoKat(1, (3, 4))(*start(P, D), 0.5)
+    h = (R + found @ B) @ B.mT
+    u, _, v = torch.linalg.svd(h[0, :, 0].view(3, 4))
+    best = torch.outer(u[:, 0], v[0]).flatten()
+    torch.testing.assert_close(found[0, :, 0], best * torch.sign(best @ found[0, :, 0]))
+    with pytest.raises(ValueError, match="12 pixels"):
+        DinoKat()(*start(P, D), 0.5)
+    with pytest.raises(ValueError, match="rank=0"):
+        DinoKat(0)
+
+
+def test_exact_ksvd_atom_is_the_leading_singular_vector():
+    P, D = random_field(1, 9, 30), unit(random_field(1, 9, 1, seed=3))
+    _, found, B = KSVD(steps=500)(*start(P, D), 0.5)
+    users = B[0, 0] != 0
+    u, s, v = torch.linalg.svd(P[0][:, users], full_matrices=False)
+    torch.testing.assert_close((found[0] @ B[0])[:, users], s[0] * torch.outer(u[:, 0], v[0]))
+
+
+def test_unused_atoms_of_ksvd_become_the_worst_patches():
+    P = random_field(1, 9, 30)
+    _, D, B = KSVD()(*start(P, unit(random_field(1, 9, 4))), 100.0)
+    assert not B.any()
+    worst = P[0][:, P[0].norm(dim=0).argsort(descending=True)[:4]]
+    torch.testing.assert_close(D[0], unit(worst))
+
+
+# ---- planted dictionaries
+
+
+def rates(learner, atoms, mu, passes):
+    """Recovery at 10, 20 and 40 dB, from patches as the first atoms."""
+    found = []
+    for snr in (10, 20, 40):
+        P = planted(atoms, 1500, 3, snr)
+        R, D, B = start(P, unit(P[..., : atoms.shape[1]]))
+        if isinstance(learner, DinoKat):
+            D = unit(torch.stack([learner.project(D[..., k : k + 1])[..., 0] for k in range(D.shape[-1])], -1))
+        for _ in range(passes):
+            R, D, B = learner(R, D, B, mu)
+        found.append(recovered(D, atoms))
+    return found
+
+
+@pytest.mark.parametrize(
+    "learner, passes, least",
+    [(SoupDIL(), 60, (0.1, 0.7, 0.7)), (KSVD(n_nonzero=3), 30, (0.1, 0.8, 0.8)), (DinoKat(), 60, (0.3, 0.7, 0.7))],
+    ids=["soup_dil", "k_svd", "dino_kat"],
+)
+def test_planted_dictionary_is_recovered(learner, passes, least):
+    found = rates(learner, low_rank_atoms(4, 24, 10), 0.5, passes)
+    print(learner, found)
+    assert all(f >= a for f, a in zip(found, least, strict=True)), found
+    assert found[0] <= found[1] + 0.05  # noise makes it harder
+
+
+# ---- in DLS
+
+
+@pytest.mark.parametrize("learner", [*LEARNERS, KSVD(n_nonzero=4), DinoKat(2)], ids=str)
+def test_every_learner_serves_dls(learner):
+    surface = SURFACES["tent"](40, dtype=F64)
+    noisy = torchdls.add_noise(surface.gradient, 10, seeded(0))
+    plain = torchdls.mean_angular_error(torchdls.LeastSquares()(noisy), surface.gradient)
+    result = DLS(learner=learner, n_iter=8, mu=1.5 * torchdls.noise_level(noisy)).solve(noisy)
+    assert (result.objective.diff(dim=1) <= 1e-9 * result.objective[:, :1]).all()
+    assert torchdls.mean_angular_error(result.height, surface.gradient) < 0.8 * plain
+    mask = DISK(40, 40)
+    masked = DLS(learner=learner, n_iter=4).solve(torch.where(mask, noisy, torch.nan), mask)
+    assert (masked.objective.diff(dim=1) <= 1e-9 * masked.objective[:, :1]).all()
+    assert masked.height.isfinite().all()
+
+
+def test_dls_defaults_and_errors():
+    noisy = torchdls.add_noise(SURFACES["tent"](24).gradient, 10, seeded(0))
+    assert torch.equal(DLS(n_iter=3)(noisy), DLS(n_iter=3, learner="soup_dil")(noisy))
+    assert torch.equal(DLS(n_iter=3, learn="fixed")(noisy), DLS(n_iter=3, learner="fixed")(noisy))
+    with pytest.raises(ValueError, match="learner='mod' is unknown"):
+        DLS(learner="mod")
+    with pytest.raises(TypeError, match="learner is a int"):
+        DLS(learner=3)
+    with pytest.raises(ValueError, match="threshold='soft' does not go with"):
+        DLS(learner="k_svd", threshold="soft")
+    with pytest.raises(ValueError, match="KSVD: steps=0"):
+        KSVD(steps=0)
+    with pytest.raises(ValueError, match="KSVD: n_nonzero=-1"):
+        KSVD(n_nonzero=-1)
