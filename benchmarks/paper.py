@@ -6,9 +6,9 @@ other integrators of the registry with their defaults. Figures 1 and 2 (renderin
 squares normals, reconstructions and zoom), and how DLS depends on its parameters. Noise draws run as one batch. Writes
 JSON, Markdown tables and PNG figures.
 
-Figure 3 is drawn for rendered terrain; with --images FOLDER, for images of yours: ten or so grey or colour images in the
-order of their names, `lights.txt` (a line x y z for each, x right, y up, z to the viewer) and, if there is one, a white
-`mask.png`.
+Figure 3 is drawn for rendered terrain; with --images FOLDER, for images of yours (the paper's Frog, say): ten or so
+grey or colour images in the order of their names, `lights.txt` (a line x y z for each, x right, y up, z to the viewer)
+and, if there is one, a white `mask.png`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ for _name, _columns in PRINTED.items():
 
 # What is swept. mu is in units of the noise of one slope; all else is passed to the integrator as it is.
 SWEEPS: dict[str, list[dict[str, Any]]] = {
-    "dls": [{"mu": f, "n_iter": 100, "tol": 3e-4} for f in (0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5)],
+    "dls": [{"mu": f, "n_iter": 60, "tol": 5e-4} for f in (0.5, 0.75, 1.0, 1.25, 1.5, 2.0)],
     "spectral_regularization": [
         {"modes": m, "basis": b} for b in ("cosine", "polynomial") for m in (6, 10, 14, 20, 28, 40, 60, 90, 140, 200)
     ],

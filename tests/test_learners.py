@@ -177,36 +177,33 @@ def test_unused_atoms_of_ksvd_become_the_worst_patches():
 # ---- planted dictionaries
 
 
-def rates(learner, atoms, mu, passes):
-    """Recovery at 10, 20 and 40 dB, from patches as the first atoms."""
-    found = []
-    for snr in (10, 20, 40):
-        P = planted(atoms, 1500, 3, snr)
-        R, D, B = start(P, unit(P[..., : atoms.shape[1]]))
+def rates(learner, mu, passes):
+    """Recovery of 16 low-rank atoms at 0, 10 and 30 dB, from 1000 patches of two atoms, the first of them to start."""
+    atoms, found = low_rank_atoms(5, 5, 16, 5), []
+    for snr in (0, 10, 30):
+        P = planted(atoms, 1000, 2, snr)
+        R, D, B = start(P, unit(P[..., :16]))
         if isinstance(learner, DinoKat):
-            D = unit(torch.stack([learner.project(D[..., k : k + 1])[..., 0] for k in range(D.shape[-1])], -1))
+            D = unit(torch.cat([learner.project(d) for d in D.split(1, -1)], -1))
         for _ in range(passes):
             R, D, B = learner(R, D, B, mu)
         found.append(recovered(D, atoms))
     return found
 
 
-@pytest.mark.parametrize(
-    "learner, passes, least",
-    [(SoupDIL(), 60, (0.1, 0.7, 0.7)), (KSVD(n_nonzero=3), 30, (0.1, 0.8, 0.8)), (DinoKat(), 60, (0.3, 0.7, 0.7))],
-    ids=["soup_dil", "k_svd", "dino_kat"],
-)
-def test_planted_dictionary_is_recovered(learner, passes, least):
-    found = rates(learner, low_rank_atoms(4, 24, 10), 0.5, passes)
-    print(learner, found)
-    assert all(f >= a for f, a in zip(found, least, strict=True)), found
-    assert found[0] <= found[1] + 0.05  # noise makes it harder
+def test_planted_dictionary_is_recovered_the_better_the_less_noise():
+    soup, ksvd, dino = rates(SoupDIL(), 0.7, 30), rates(KSVD(n_nonzero=2), 0.3, 20), rates(DinoKat(), 0.7, 20)
+    for at_0, at_10, at_30 in (soup, ksvd, dino):
+        assert at_0 < 0.2
+        assert at_10 >= 0.45
+        assert at_30 >= 0.65  # the rest are local minima: chance finds 0 of 16
+    assert dino[1] > soup[1]  # knowing that the atoms have low rank helps against noise
 
 
 # ---- in DLS
 
 
-@pytest.mark.parametrize("learner", [*LEARNERS, KSVD(n_nonzero=4), DinoKat(2)], ids=str)
+@pytest.mark.parametrize("learner", [*LEARNERS, KSVD(steps=2), DinoKat(2)], ids=str)
 def test_every_learner_serves_dls(learner):
     surface = SURFACES["tent"](40, dtype=F64)
     noisy = torchdls.add_noise(surface.gradient, 10, seeded(0))
