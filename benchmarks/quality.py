@@ -156,7 +156,7 @@ def main() -> None:
     n, n_iter = (48, 3) if args.smoke else (200, 100)
     sweep: Sequence[float] = (1.5,) if args.smoke else SWEEP
     if args.trials:
-        trials = run_trials(Case("tent", (1, 10, 20), seeds, n), n_iter, (1.0, 1.5, 2.0) if not args.smoke else sweep)
+        trials = run_trials(Case("tent", (1, 10, 20), seeds, n), n_iter, (1.0, 1.5) if not args.smoke else sweep)
         path = write_json(out / "trials.json", trials=trials)
     else:
         rows = [row for name in PAPER for row in run_table(Case(name, SNRS, seeds, n), n_iter, sweep)]
