@@ -17,6 +17,7 @@ from torchdls import (
     DLS,
     INTEGRATORS,
     L1,
+    AnisotropicDiffusion,
     HornBrooks,
     Huber,
     Integrator,
@@ -59,6 +60,7 @@ VARIANTS: dict[str, dict[str, Callable[[], Integrator]]] = {
         "default": lambda: MEstimator(floor=0.1, **FEW),
         "tukey": lambda: MEstimator("tukey", floor=0.1, **FEW),
     },
+    "anisotropic_diffusion": {"default": lambda: AnisotropicDiffusion(beta=0.2, **FEW)},
     "mumford_shah": {"default": lambda: MumfordShah(floor=0.1, **FEW)},
     "dls": {
         "default": dls(),

@@ -61,6 +61,7 @@ INTEGRATORS = Registry(
         "l1": "L1",
         "huber": "Huber",
         "m_estimator": "MEstimator",
+        "anisotropic_diffusion": "AnisotropicDiffusion",
         "mumford_shah": "MumfordShah",
         "dls": "DLS",
         "slope_dls": "SlopeDLS",

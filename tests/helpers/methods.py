@@ -31,7 +31,7 @@ class Method:
         return INTEGRATORS[name](**{**self.options, **more})
 
 
-ONE_SCALE = {"components_are_independent": "one noise level is read from the whole surface"}
+ONE_SCALE = {"components_are_independent": "one scale of slopes is read from the whole surface"}
 
 METHODS: dict[str, Method] = {
     "least_squares": Method({"tol": 1e-12}),
@@ -43,6 +43,7 @@ METHODS: dict[str, Method] = {
     "l1": Method({"n_iter": 10}, tol=1e-4, no=ONE_SCALE),
     "huber": Method({"n_iter": 10}, tol=1e-4, no=ONE_SCALE),
     "m_estimator": Method({"n_iter": 5, "floor": 0.1}, tol=1e-3, no=ONE_SCALE),
+    "anisotropic_diffusion": Method({"beta": 0.2, "n_iter": 10}, tol=1e-4, no=ONE_SCALE),
     "mumford_shah": Method({"n_iter": 5, "floor": 0.1}, tol=1e-3, no=ONE_SCALE),
     "dls": Method(
         {"patch_size": 4, "stride": 2, "n_atoms": 16, "mu": 0.3, "n_iter": 3, "tol": 0.0, "unused": "keep"},

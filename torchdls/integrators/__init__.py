@@ -10,6 +10,7 @@ from torchdls.integrators.least_squares import LeastSquares
 from torchdls.integrators.line_integral import LineIntegral
 from torchdls.integrators.robust import (
     L1,
+    AnisotropicDiffusion,
     Huber,
     MEstimator,
     MumfordShah,
@@ -21,6 +22,7 @@ from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
 from torchdls.integrators.sylvester import HarkerOLeary, SpectralRegularization, TikhonovRegularization
 
 __all__ = [
+    "AnisotropicDiffusion",
     "Huber",
     "L1",
     "MEstimator",

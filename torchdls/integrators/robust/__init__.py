@@ -2,11 +2,13 @@
 
 from torchdls.integrators.robust.base import Robust, RobustResult
 from torchdls.integrators.robust.convex import L1, Huber, TotalVariation
+from torchdls.integrators.robust.diffusion import AnisotropicDiffusion
 from torchdls.integrators.robust.mumford_shah import MumfordShah
 from torchdls.integrators.robust.reweighted import MEstimator
 from torchdls.integrators.robust.weighted import WeightedLeastSquares
 
 __all__ = [
+    "AnisotropicDiffusion",
     "Huber",
     "L1",
     "MEstimator",

@@ -63,8 +63,12 @@ class Terms(NamedTuple):
 
     def residual(self, z: Tensor) -> Tensor:
         """(N, M, 2, H, W), 0 where there is no edge."""
+        return self.difference(z) - torch.where(self.live, self.slopes, 0)
+
+    def difference(self, z: Tensor) -> Tensor:
+        """What a height adds to the residuals: its own slopes (N, M, 2, H, W), 0 where there is no edge."""
         slopes = GradientOperator("forward", self.steps)(z)
-        return torch.where(self.live, _spread(slopes, self.joint) - self.slopes, 0)
+        return torch.where(self.live, _spread(slopes, self.joint), 0)
 
     def size(self, r: Tensor) -> Tensor:
         """Magnitude of the residuals: (N, 2, 2, H, W) if separate, (N, 4, 1, H, W) for joint ones."""
