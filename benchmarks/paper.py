@@ -42,9 +42,9 @@ PRINTED = {
 for _name, _columns in PRINTED.items():
     _columns |= {"dls": PAPER[_name]["dls"], "least_squares": PAPER[_name]["dctls"]}
 
-# What is swept. mu is in units of the noise of one slope; all else is passed to the integrator as it is.
+# What is swept. mu is in units of the estimated noise of one slope; all else is passed to the integrator as it is.
 SWEEPS: dict[str, list[dict[str, Any]]] = {
-    "dls": [{"mu": f, "n_iter": 60, "tol": 5e-4} for f in (0.5, 0.75, 1.0, 1.25, 1.5, 2.0)],
+    "dls": [{"mu": f} for f in (0.5, 0.75, 1.0, 1.25, 1.5, 2.0)],
     "spectral_regularization": [
         {"modes": m, "basis": b} for b in ("cosine", "polynomial") for m in (6, 10, 14, 20, 28, 40, 60, 90, 140, 200)
     ],
@@ -211,11 +211,12 @@ def main() -> None:
     if args.smoke:
         sweeps = {k: v[1:3] or v for k, v in sweeps.items()}
         sweeps["dls"] = [o | {"n_iter": 2} for o in sweeps["dls"]]
+    snrs, all_snrs = ((20, 30), (30,)) if args.smoke else (SNRS, (10, 30))
     rows, others = [], []
     for name in PRINTED:
-        rows += paper_rows(Case(name, SNRS, seeds, n), Case(name, SNRS, seeds[:SWEPT_DRAWS], n), sweeps)
-        others += all_rows(Case(name, (10, 30), seeds[:1], n))
-    curves = dependence(Case("tent", (1, 10, 20), seeds[:1], n), args.smoke)
+        rows += paper_rows(Case(name, snrs, seeds, n), Case(name, snrs, seeds[:SWEPT_DRAWS], n), sweeps)
+        others += all_rows(Case(name, all_snrs, seeds[:1], n))
+    curves = dependence(Case("tent", (20,) if args.smoke else (1, 10, 20), seeds[:1], n), args.smoke)
     figure_3 = photometric_figure(out / "paper_figure_3.png", args.images, 48 if args.smoke else 200, COLUMNS)
     for number, (name, snr) in enumerate((("tent", 20), ("vase", 30)), 1):
         chosen = next(r for r in rows if r["surface"] == name and r["snr"] == snr)
