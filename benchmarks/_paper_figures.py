@@ -14,6 +14,7 @@ from torch import Tensor
 
 import torchdls
 from torchdls import INTEGRATORS, SURFACES, add_noise
+from torchdls._files import read_file
 from torchdls.plot import hillshade
 
 
@@ -60,20 +61,15 @@ def comparison(path: Path, name: str, snr: int, n: int, row: dict[str, Any], col
 
 def read_images(folder: Path) -> tuple[Tensor, Tensor, Tensor | None]:
     """Images (1, K, H, W), lights (K, 3), mask or None of a folder as `paper.py --help` describes it."""
-    import imageio.v3 as imageio
-
     lights = torch.from_numpy(np.loadtxt(folder / "lights.txt", ndmin=2)).float()
-    kinds = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"}
+    kinds = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
     files = sorted(f for f in folder.iterdir() if f.suffix.lower() in kinds and f.stem != "mask")
     if len(files) != len(lights):
         raise ValueError(f"{folder}: {len(files)} images, but {len(lights)} lines in lights.txt")
-    images = [np.asarray(imageio.imread(f), dtype=np.float32) for f in files]
+    images = [np.asarray(read_file(f, kinds), dtype=np.float32) for f in files]  # 16 bits stay 16 bits
     grey = torch.from_numpy(np.stack([i[..., :3].mean(-1) if i.ndim == 3 else i for i in images]))
     file = folder / "mask.png"
-    mask = None
-    if file.exists():
-        white = np.asarray(imageio.imread(file))
-        mask = torch.from_numpy((white[..., 0] if white.ndim == 3 else white) > 0)[None, None]
+    mask = torchdls.load_mask(file) if file.exists() else None
     return (grey / grey.max())[None], lights, mask
 
 
@@ -129,6 +125,6 @@ def sweep_plot(path: Path, curves: Mapping[str, Mapping[str, Any]]) -> None:
         axis.set_xlabel(label)
         axis.set_xscale("log" if label in ("lam", "iterations") else "linear")
         axis.grid(alpha=0.3)
-    axes[0].set_ylabel("gain: (1 - SSIM) of least squares / of DLS")
+    axes[0].set_ylabel("(1 - SSIM) of DCTLS / of DLS")
     axes[0].legend()
     figure.savefig(path, dpi=90)
