@@ -92,6 +92,8 @@ def photometric_figure(path: Path, folder: Path | None, n: int, columns: Mapping
     field = torchdls.normals_to_gradient(found.normals)
     mask = field.mask if mask is not None else None
     heights = default_heights(field.gradient, columns, mask)
+    if mask is not None:
+        heights = {label: torch.where(mask, z, torch.nan) for label, z in heights.items()}
     panels = {"one of the images": images[:, :1]} | ({} if truth is None else {"ground truth": truth}) | heights
     h, w = images.shape[-2:]
     zoom = (slice(h * 3 // 8, h * 5 // 8), slice(w * 3 // 8, w * 5 // 8))
