@@ -71,8 +71,7 @@ def small_problem(masked: bool, weighted: bool, channels: int = 2):
     return g, mask if masked else None, weight if weighted else None
 
 
-@pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("masked, weighted", [(False, False), (True, True)])
 def test_l1_is_the_linear_program(masked, weighted):
     g, mask, weight = small_problem(masked, weighted)
     k, v, t = stack(residual_rows(g, mask, weight))
@@ -81,7 +80,7 @@ def test_l1_is_the_linear_program(masked, weighted):
     eye = np.eye(m)
     bounds = [(None, None)] * n + [(0, None)] * m
     lp = linprog(cost, np.block([[k, -eye], [-k, -eye]]), np.concatenate([v, -v]), bounds=bounds)
-    n_iter, close = (100, 2e-2) if masked else (1000, 2e-3)  # without a mask, the solves are direct
+    n_iter, close = (60, 2e-2) if masked else (1000, 2e-3)  # without a mask, the solves are direct
     z = L1(smoothing=0, n_iter=n_iter, tol=0, solve_tol=1e-8)(g, mask, weight)
     assert t @ np.abs(k @ z.flatten().numpy() - v) == pytest.approx(lp.fun, rel=close)
 
@@ -242,7 +241,7 @@ def test_weighted_least_squares_distrusts_the_curl():
     assert rmse(WeightedLeastSquares()(g), surface.height) < 0.2 * rmse(LeastSquares()(g), surface.height)
     method = WeightedLeastSquares()
     _, w = method.edges(method.check(surface.gradient.new_ones(1, 2, 5, 6)))  # a plane is all integrable
-    torch.testing.assert_close(w[:, 0, :, :-1], torch.full_like(w[:, 0, :, :-1], 1.001))
+    torch.testing.assert_close(w[:, 0, :, :-1], torch.full_like(w[:, 0, :, :-1], 1.03))
     assert (w[:, 0, :, -1] == 0).all()
     assert (w[:, 1, -1] == 0).all()
 

@@ -120,5 +120,7 @@ class MEstimator(Robust):
 
 
 def huber_start(method: Robust, fields: Fields) -> Tensor:
-    """The convex surface of `Huber`, roughly, from which the objectives that are not convex start."""
-    return Huber(n_iter=method.n_iter, tol=100 * method.tol, solve_tol=method.solve_tol).integrate(fields)
+    """The convex surface of `Huber`, nearly, from which the objectives that are not convex start."""
+    return Huber(n_iter=2 * method.n_iter, tol=min(100 * method.tol, 1e-4), solve_tol=method.solve_tol).integrate(
+        fields
+    )

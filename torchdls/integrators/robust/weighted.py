@@ -47,9 +47,9 @@ class WeightedLeastSquares(LeastSquares):
     def __init__(
         self,
         threshold: float = 3.0,
-        floor: float = 1e-3,
+        floor: float = 0.03,
         tol: float = 1e-6,
-        max_iter: int = 500,
+        max_iter: int = 2000,
         *,
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
