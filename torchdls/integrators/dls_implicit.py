@@ -13,20 +13,25 @@ d(z, b) = K^{-1} (df - dK (z, b)), whatever the number of iterations. The suppor
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchdls.dictionary.thresholds import Threshold
-from torchdls.integrators.dls_state import Model, support
+from torchdls.integrators.dls_state import Model
 from torchdls.operators import GradientOperator, Patches
 from torchdls.solvers import ConvergenceWarning, conjugate_gradients
+from torchdls.solvers.cg import LinearMap
 from torchdls.solvers.poisson import fold_vmap, preconditioner, present_edges
 
 # The codes leave smooth heights to the data term alone; so small a part of the patches' trust stands for them in the
 # preconditioner (measured: from .03 to 3e-5 the number of steps is near its least).
 _LOOSE = 1e-4
+
+# Patches whose small systems are set up at a time.
+_CHUNK = 4096
 
 
 class _Setting(NamedTuple):
@@ -160,60 +165,64 @@ class _System(NamedTuple):
     setting: _Setting
 
     def solve(self, f_z: Tensor, f_b: Tensor) -> tuple[Tensor, Tensor]:
-        """K^{-1} f. Where D^T D = I and every pixel counts, the codes are eliminated exactly; else both are unknown."""
-        if self.valid is None and self._orthonormal():
-            return self._eliminated(f_z, f_b)
-        return self._joint(f_z, f_b)
+        """K^{-1} f, the codes eliminated patch by patch.
 
-    def _orthonormal(self) -> bool:
-        gram, eye = self.D.mT @ self.D, torch.eye(self.D.shape[-1], dtype=self.D.dtype, device=self.D.device)
-        return bool((gram - eye).abs().max() < 100 * torch.finfo(gram.dtype).eps)
-
-    def _eliminated(self, f_z: Tensor, f_b: Tensor) -> tuple[Tensor, Tensor]:
-        """Codes b = D^T P z + f_b / 2 lam on the support: what is left is A^T w A + r + 2 lam fold(I - D S D^T) P."""
+        With X = M P z, the codes of a patch are b = G^{-1} (D^T X + f_b / 2 lam) on its support, G = D^T M D there.
+        What is left for the height is A^T w A z + r z + 2 lam fold(X - M D b).
+        """
+        codes_of = self._codes_of()
         strength = 2 * self.lam
         b0 = f_b / torch.where(strength > 0, strength, 1)
-        kept = self.free.mT.to(f_z.dtype).contiguous()  # patch by patch, as the patches lie in memory
 
         def apply(z: Tensor) -> Tensor:
-            X = self._extract(z).mT
-            X.baddbmm_((X @ self.D).mul_(kept), self.D.mT, alpha=-1)
-            return self._data(z) + self._fold(X.mT)
+            X = self._patches(z).mT  # patch by patch, as they lie in memory
+            X.baddbmm_(codes_of(X @ self.D), self.D.mT, alpha=-1)
+            return self._data(z) + self._fold(_inside(X.mT, self.valid))
 
-        z = self._cg(apply, self._loose(), f_z + self._fold(self.D @ b0))
-        return z, b0 + ((self._extract(z).mT @ self.D).mul_(kept)).mT
+        held = self.D @ codes_of(b0.mT.contiguous()).mT
+        z = self._cg(apply, f_z + self._fold(_inside(held, self.valid)))
+        return z, codes_of(self._patches(z).mT @ self.D + b0.mT).mT
 
-    def _joint(self, f_z: Tensor, f_b: Tensor) -> tuple[Tensor, Tensor]:
-        """Unknowns z and the codes on the support, side by side; block elimination with D^T D = I preconditions."""
-        h, wd = f_z.shape[-2:]
-        index, used = support(self.free)
-        strength, loose = 2 * self.lam[..., 0], self._loose()
+    def _codes_of(self) -> Callable[[Tensor], Tensor]:
+        """The map from D^T X (N, L, K) to G^{-1} D^T X on the support of each patch; it may overwrite its argument."""
+        free = self.free.mT.contiguous()
+        gram = self.D.mT @ self.D
+        eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
+        if self.valid is None and bool((gram - eye).abs().max() < 100 * torch.finfo(gram.dtype).eps):
+            kept = free.to(gram.dtype)
+            return lambda x: x.mul_(kept)
+        size = max(int(free.sum(-1).max()), 1)
+        places = torch.cat([f.to(torch.uint8).topk(size, -1).indices for f in free.split(_CHUNK, 1)], 1)
+        used = free.gather(2, places)
+        inverse = torch.cat([self._inverse_grams(*c) for c in self._chunks(places, used)], 1)
 
-        def join(z: Tensor, codes: Tensor) -> Tensor:
-            values = torch.where(used, codes.flatten(1).gather(1, index), 0)
-            return torch.cat([z.flatten(1), values], 1)[..., None, None]
+        def solve(x: Tensor) -> Tensor:
+            codes = (inverse @ torch.where(used, x.gather(2, places), 0)[..., None])[..., 0]
+            return x.zero_().scatter_(2, places, torch.where(used, codes, 0))
 
-        def split(x: Tensor) -> tuple[Tensor, Tensor]:
-            x = x[..., 0, 0]
-            values = torch.where(used, x[:, h * wd :], 0)
-            codes = torch.zeros_like(self.free, dtype=x.dtype).flatten(1).scatter_add_(1, index, values)
-            return x[:, : h * wd].unflatten(1, (1, h, wd)), codes.view(self.free.shape)
+        return solve
 
-        def apply(x: Tensor) -> Tensor:
-            z, codes = split(x)
-            R = _inside(self._extract(z) - self.D @ codes, self.valid)
-            return join(self._data(z) + self._fold(R), -strength[..., None] * (self.D.mT @ R))
+    def _chunks(self, places: Tensor, used: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+        valid = (
+            [None] * len(range(0, places.shape[1], _CHUNK)) if self.valid is None else self.valid.mT.split(_CHUNK, 1)
+        )
+        return zip(places.split(_CHUNK, 1), used.split(_CHUNK, 1), valid, strict=True)
 
-        def precondition(x: Tensor) -> Tensor:
-            z, codes = split(x)
-            codes = codes / torch.where(strength > 0, strength, 1)[..., None]
-            z = loose(z + self._fold(_inside(self.D @ codes, self.valid)))
-            return join(z, codes + self.D.mT @ _inside(self._extract(z), self.valid))
+    def _inverse_grams(self, places: Tensor, used: Tensor, valid: Tensor | None) -> Tensor:
+        """(N, l, s, s) inverses of G over the s places of l patches; a ridge of sqrt(eps) for dependent atoms."""
+        surfaces = torch.arange(len(places), device=places.device)[:, None, None]
+        atoms = self.D.mT[surfaces, places] * used[..., None]
+        atoms = atoms if valid is None else atoms * valid[:, :, None]
+        ridge = torch.where(used, torch.finfo(atoms.dtype).eps ** 0.5, 1)
+        return torch.cholesky_inverse(torch.linalg.cholesky(atoms @ atoms.mT + torch.diag_embed(ridge)))
 
-        return split(self._cg(apply, precondition, join(f_z, f_b)))
+    def _patches(self, z: Tensor) -> Tensor:
+        return _inside(self.setting.patches.extract(z), self.valid)
 
-    def _cg(self, apply: Any, precondition: Any, b: Tensor) -> Tensor:
-        result = conjugate_gradients(apply, precondition, b, None, tol=self.setting.tol, max_iter=self.setting.max_iter)
+    def _cg(self, apply: LinearMap, b: Tensor) -> Tensor:
+        result = conjugate_gradients(
+            apply, self._loose(), b, None, tol=self.setting.tol, max_iter=self.setting.max_iter
+        )
         if not bool(result.converged.all()):
             warnings.warn(
                 f"DLS: the implicit derivative stopped after {self.setting.max_iter} iterations at a relative residual "
@@ -223,7 +232,7 @@ class _System(NamedTuple):
             )
         return result.x
 
-    def _loose(self) -> Any:
+    def _loose(self) -> LinearMap:
         inside = torch.ones_like(self.D[:, :, :1]).expand(-1, -1, self.free.shape[-1])
         coverage = self.setting.patches.adjoint(_inside(inside, self.valid), self.r.shape)
         return preconditioner(self.w, self.r + 2 * _LOOSE * self.lam[..., None] * coverage, self.setting.pixel_size)
@@ -231,9 +240,6 @@ class _System(NamedTuple):
     def _data(self, z: Tensor) -> Tensor:
         a = GradientOperator("forward", self.setting.pixel_size)
         return a.adjoint(self.w * a(z)) + self.r * z
-
-    def _extract(self, z: Tensor) -> Tensor:
-        return self.setting.patches.extract(z)
 
     def _fold(self, X: Tensor) -> Tensor:
         return 2 * self.lam[..., None] * self.setting.patches.adjoint(X, self.r.shape)

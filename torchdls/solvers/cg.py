@@ -21,7 +21,14 @@ class CGResult(NamedTuple):
 
 
 def conjugate_gradients(
-    apply: LinearMap, precondition: LinearMap, b: Tensor, x0: Tensor | None, *, tol: float, max_iter: int
+    apply: LinearMap,
+    precondition: LinearMap,
+    b: Tensor,
+    x0: Tensor | None,
+    *,
+    tol: float,
+    max_iter: int,
+    project: LinearMap | None = None,
 ) -> CGResult:
     """Solve H x = b for every system of the batch.
 
@@ -32,6 +39,8 @@ def conjugate_gradients(
         x0: (N, ...) warm start, or None for 0.
         tol: a system stops once ||r|| <= tol ||b||, with r the residual of the recursion (free of rounding in x).
         max_iter: limit of iterations.
+        project: orthogonal projection on the range of a singular H. Rounding leaves it, and a preconditioner that does
+            not commute with it would take what is outside for progress.
 
     A system that has stopped is frozen: its result does not depend on its neighbours in the batch.
     """
@@ -55,6 +64,7 @@ def conjugate_gradients(
         step = _ratio(rho_new, _dot(p, q), active)
         x += step * p
         r -= step * q
+        r = r if project is None else project(r)
         rho = rho_new
         iterations += active
         active = active & (_norm(r) > goal)

@@ -169,10 +169,11 @@ class _Solve(torch.autograd.Function):
         x, iterations, residual, converged = conjugate_gradients(
             _normal(w, r, setting),
             preconditioner(w, r, setting.pixel_size),
-            gauge.remove(b),
+            gauge.remove(gauge.remove(b)),  # again: a mean left by rounding lies outside the range of H
             z0,
             tol=setting.tol,
             max_iter=setting.max_iter,
+            project=gauge.remove if bool(gauge.share.any()) else None,
         )
         if not bool(converged.all()):
             _warn(residual, converged, setting)
