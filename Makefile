@@ -23,6 +23,7 @@ SCRATCH := build
 # Benchmarks are pytest files (bench_*.py) and scripts that take --smoke; a leading underscore marks a helper.
 BENCH_TESTS := $(wildcard benchmarks/bench_*.py benchmarks/test_*.py)
 BENCH_SCRIPTS := $(filter-out $(BENCH_TESTS) benchmarks/conftest.py benchmarks/_%,$(wildcard benchmarks/*.py))
+SMOKE_SIZES := not 512 and not 1024 and not 2048 and not 64-64
 NOTEBOOKS := $(patsubst notebooks/%.py,%,$(wildcard notebooks/*.py))
 
 .PHONY: help demo test lint format types notebooks notebooks-update picture bench-smoke check clean
@@ -66,7 +67,7 @@ picture: demo
 	p.resize((900, p.height * 900 // p.width), Image.Resampling.LANCZOS).quantize(256).save('docs/demo.png', optimize=True)"
 
 bench-smoke: $(VENV)/.dev
-	$(if $(BENCH_TESTS),$(BIN)/python -m pytest --benchmark-disable --quiet $(BENCH_TESTS))
+	$(if $(BENCH_TESTS),$(BIN)/python -m pytest --benchmark-disable --quiet -k "$(SMOKE_SIZES)" $(BENCH_TESTS))
 	@set -e; for script in $(BENCH_SCRIPTS); do echo "$$script --smoke"; $(BIN)/python $$script --smoke; done
 
 check: test lint types notebooks bench-smoke
