@@ -38,7 +38,8 @@ def write_json(path: Path | str, **content: Any) -> Path:
     """Write the content with its environment."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"environment": environment(), **content}, indent=1) + "\n")
+    environment_of_run = AT_START | {"threads": torch.get_num_threads()}
+    path.write_text(json.dumps({"environment": environment_of_run, **content}, indent=1) + "\n")
     return path
 
 
@@ -76,3 +77,6 @@ def _git(*args: str) -> str:
 def summary(values: Mapping[str, torch.Tensor]) -> dict[str, float]:
     """Means of named tensors as plain numbers."""
     return {name: float(value.double().mean()) for name, value in values.items()}
+
+
+AT_START = environment()  # a long run belongs to the commit that it started from
