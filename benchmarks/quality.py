@@ -34,7 +34,7 @@ PAPER = {
         "dctls": (0.894, 0.915, 0.936, 0.966, 0.981, 0.989, 0.992, 0.993),
     },
 }
-SWEEP = (1.0, 1.25, 1.5, 2.0, 2.5)  # thresholds mu, in units of the noise of one gradient sample
+SWEEP = (1.0, 1.25, 1.5, 2.0, 2.5, 3.5, 5.0)  # thresholds mu, in units of the noise of one gradient sample
 TRIALS: dict[str, dict[str, Any]] = {
     "paper's set-up (reference)": {},
     "block order": {"order": "block"},
