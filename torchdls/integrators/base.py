@@ -61,9 +61,8 @@ class Integrator(nn.Module):
         Raises:
             TypeError: an argument is not a tensor, or the mask is not bool.
             ValueError: a shape, dtype or device does not fit, a value inside the mask is not finite, a weight is
-            negative,
-                a mask is all False, an anchor comes without its weight, or the method does not take one of them (see
-                `accepts`). The message names the argument and the shapes.
+                negative, a mask is all False, an anchor comes without its weight, or the method does not take one of
+                them (see `accepts`). The message names the argument and the shapes.
         """
         fields = self.check(gradient, mask, weight, anchor, anchor_weight)
         height = self.integrate(fields)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -21,6 +21,7 @@ from torchdls.integrators.dls_checks import check_dictionary, check_size, parame
 from torchdls.integrators.dls_implicit import at_fixed_point
 from torchdls.integrators.dls_options import Grad, Learn, check_options, choose_learner, derivative, keep
 from torchdls.integrators.dls_state import Model, Part, State, merge, patch_cost, worthwhile
+from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.least_squares import LeastSquares
 from torchdls.integrators.window import live_window
 from torchdls.noise import noise_level
@@ -31,8 +32,6 @@ from torchdls.solvers import harmonic_extension, remove_free_constants, solve
 # alike (benchmarks/quality.py).
 _AUTO_LAM = 0.5
 _AUTO_MU = 1.0
-
-Callback = Callable[[int, Tensor], None]
 
 
 class DLSResult(NamedTuple):
@@ -60,7 +59,7 @@ class DLSResult(NamedTuple):
     converged: Tensor
 
 
-class DLS(Integrator):
+class DLS(Iterative[DLSResult]):
     r"""Dictionary learning on surfaces.
 
         min over z, B, D   data(z) + lam ( \sum_j ||P_j z - D b_j||^2 + mu^2 ||B||_0 ),   ||d_i|| = 1, |b_ji| <= bound
@@ -177,37 +176,11 @@ class DLS(Integrator):
         keep(self, "dictionary", initial)
         self.grad = derivative(grad, learn, threshold, self._steady, initial)
 
-    def integrate(self, fields: Fields) -> Tensor:
-        """Height (N, 1, H, W) in pixels."""
-        return self._run(fields, None).height
-
-    def solve(
-        self,
-        gradient: Tensor,
-        mask: Tensor | None = None,
-        weight: Tensor | None = None,
-        anchor: Tensor | None = None,
-        anchor_weight: Tensor | float | None = None,
-        *,
-        callback: Callback | None = None,
-    ) -> DLSResult:
-        """Integrate as `forward` does, and tell everything that was found on the way.
-
-        Args:
-            gradient: see `forward`, and so for the mask, weight and anchors; a single field is a batch of one.
-            mask: see `forward`.
-            weight: see `forward`.
-            anchor: see `forward`.
-            anchor_weight: see `forward`.
-            callback: called after each iteration as callback(iteration, objective (N,)), with iterations from 1.
-
-        Returns:
-            DLSResult(height, dictionary, codes, objective, noise, lam, mu, converged).
-        """
-        result = self._run(self.check(gradient, mask, weight, anchor, anchor_weight), callback)
+    def in_units(self, result: DLSResult) -> DLSResult:
+        """Height and codes in the unit of `pixel_size`."""
         return result._replace(height=result.height * self.unit, codes=result.codes * self.unit)
 
-    def _run(self, fields: Fields, callback: Callback | None) -> DLSResult:
+    def iterate(self, fields: Fields, callback: Callback | None = None) -> DLSResult:
         """The iterations, within the window of the patches that a mask leaves alive."""
         check_size(fields.gradient, self.patches)
         noise = self._noise(fields)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from torchdls._tape import visible
-from torchdls.integrators.base import Fields, Integrator, edge_cost
+from torchdls.integrators.base import Fields, edge_cost
+from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.outliers import replace_outliers
 from torchdls.integrators.slope_coding import Aggregate, Noise, SlopeScale, average, extend_edges
 from torchdls.noise import noise_level
@@ -18,7 +19,6 @@ from torchdls.selection import discrepancy_guard, probe, sure_guard
 from torchdls.solvers import harmonic_extension, solve
 from torchdls.solvers.poisson import edge_ends
 
-Callback = Callable[[int, Tensor], None]
 Guard = Literal["discrepancy", "sure"]
 
 _KAPPA = 25.0  # trust in the coded slopes, as a multiple of that in the measured ones
@@ -45,7 +45,7 @@ class SlopeDLSResult(NamedTuple):
     confidence: Tensor
 
 
-class SlopeDLS(Integrator):
+class SlopeDLS(Iterative[SlopeDLSResult]):
     r"""Dictionary learning on the slopes at several scales, with nothing to tune.
 
     The noise of the data is white in the slopes, and integration colours it in a known way. So the slopes are what is
@@ -134,37 +134,12 @@ class SlopeDLS(Integrator):
         recipe: dict[str, Any] = {"tau": 2.7, "n_iter": 1, "learn": False, "aggregate": "sparsity"}
         return cls(**({"patch_sizes": (8, 16, 32)} | recipe | options))
 
-    def integrate(self, fields: Fields) -> Tensor:
-        """Height (N, 1, H, W) in pixels."""
-        return self._solve(fields, None).height
-
-    def solve(
-        self,
-        gradient: Tensor,
-        mask: Tensor | None = None,
-        weight: Tensor | None = None,
-        anchor: Tensor | None = None,
-        anchor_weight: Tensor | float | None = None,
-        *,
-        callback: Callback | None = None,
-    ) -> SlopeDLSResult:
-        """Integrate as `forward` does, and tell everything that was found on the way.
-
-        Args:
-            gradient: see `forward`, and so for the mask, weight and anchors; a single field is a batch of one.
-            mask: see `forward`.
-            weight: see `forward`.
-            anchor: see `forward`.
-            anchor_weight: see `forward`.
-            callback: called after each iteration as callback(iteration, misfit (N,)), with iterations from 1.
-
-        Returns:
-            SlopeDLSResult(height, dictionary, codes, misfit, noise, confidence).
-        """
-        result = self._solve(self.check(gradient, mask, weight, anchor, anchor_weight), callback)
+    def in_units(self, result: SlopeDLSResult) -> SlopeDLSResult:
+        """The height in the unit of `pixel_size`; slopes and their codes have none."""
         return result._replace(height=result.height * self.unit)
 
-    def _solve(self, fields: Fields, callback: Callback | None) -> SlopeDLSResult:
+    def iterate(self, fields: Fields, callback: Callback | None = None) -> SlopeDLSResult:
+        """Outliers replaced, the iterations, and the guard."""
         trusted = torch.ones_like(fields.gradient[:, :1]) if fields.mask is None else fields.mask.to(fields.gradient)
         if fields.mask is not None and visible(fields.mask) and bool(fields.mask.all()):
             fields = fields._replace(mask=None)  # the direct solve serves

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from torchdls.integrators.base import Fields, Integrator
+from torchdls.integrators.base import Fields
+from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.operators import edge_slopes
 from torchdls.solvers import solve
 
-Callback = Callable[[int, Tensor], None]
 State = tuple[Tensor, ...]  # the height first, then whatever else an iteration hands to the next; all (N, ...)
 
 
@@ -46,7 +46,7 @@ class DataTerm(Protocol):
         """
 
 
-class Robust(Integrator):
+class Robust(Iterative[RobustResult]):
     """An integrator that repeats the solve (*) until its own objective settles, surface by surface.
 
     A subclass provides its `data_term`. Its majoriser makes it a data term of DLS; solving for the minimum of the
@@ -89,37 +89,12 @@ class Robust(Integrator):
         """(N,) the data term at z, in pixels."""
         return self.data_term(fields).cost(z)
 
-    def integrate(self, fields: Fields) -> Tensor:
-        """Height (N, 1, H, W) in pixels."""
-        return self._run(fields, None).height
-
-    def solve(
-        self,
-        gradient: Tensor,
-        mask: Tensor | None = None,
-        weight: Tensor | None = None,
-        anchor: Tensor | None = None,
-        anchor_weight: Tensor | float | None = None,
-        *,
-        callback: Callback | None = None,
-    ) -> RobustResult:
-        """Integrate as `forward` does, and tell how it went.
-
-        Args:
-            gradient: see `forward`, and so for the mask, weight and anchors; a single field is a batch of one.
-            mask: see `forward`.
-            weight: see `forward`.
-            anchor: see `forward`.
-            anchor_weight: see `forward`.
-            callback: called after each iteration as callback(iteration, objective (N,)), with iterations from 1.
-
-        Returns:
-            RobustResult(height, objective, iterations, converged).
-        """
-        result = self._run(self.check(gradient, mask, weight, anchor, anchor_weight), callback)
+    def in_units(self, result: RobustResult) -> RobustResult:
+        """The height in the unit of `pixel_size`."""
         return result._replace(height=result.height * self.unit)
 
-    def _run(self, fields: Fields, callback: Callback | None) -> RobustResult:
+    def iterate(self, fields: Fields, callback: Callback | None = None) -> RobustResult:
+        """The iterations, each surface until its objective settles."""
         data = self.data_term(fields)
         state = self._begin(fields, data)
         rounding = 10 * torch.finfo(state[0].dtype).eps * _objective(fields, data, torch.zeros_like(state[0])).detach()

@@ -1,0 +1,71 @@
+"""The call that tells everything: what integrators share that iterate and have more to return than the height."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Generic, Protocol, TypeVar
+
+from torch import Tensor
+
+from torchdls.integrators.base import Fields, Integrator
+
+Callback = Callable[[int, Tensor], None]
+
+
+class HasHeight(Protocol):
+    """A result that holds a height, among other things."""
+
+    @property
+    def height(self) -> Tensor:
+        """(N, 1, H, W)."""
+
+
+Result = TypeVar("Result", bound=HasHeight)
+
+
+class Iterative(Integrator, Generic[Result]):
+    """An integrator that iterates; a subclass provides `iterate` and `in_units`, and says what its result holds."""
+
+    @abstractmethod
+    def iterate(self, fields: Fields, callback: Callback | None = None) -> Result:
+        """The result from checked fields, with heights in pixels."""
+
+    @abstractmethod
+    def in_units(self, result: Result) -> Result:
+        """The result with its heights, and what else has their unit, in the unit of `pixel_size`."""
+
+    def integrate(self, fields: Fields) -> Tensor:
+        """Height (N, 1, H, W) in pixels."""
+        return self.iterate(fields).height
+
+    def solve(
+        self,
+        gradient: Tensor,
+        mask: Tensor | None = None,
+        weight: Tensor | None = None,
+        anchor: Tensor | None = None,
+        anchor_weight: Tensor | float | None = None,
+        *,
+        callback: Callback | None = None,
+    ) -> Result:
+        """Integrate as `forward` does, and tell everything that was found on the way.
+
+        Args:
+            gradient: see `forward`, and so for the mask, weight and anchors; a single field is a batch of one.
+            mask: see `forward`.
+            weight: see `forward`.
+            anchor: see `forward`.
+            anchor_weight: see `forward`.
+            callback: called after each iteration as callback(iteration, cost (N,)), with iterations from 1 and the
+                cost whose history the result holds.
+
+        Returns:
+            The named tuple of the method, always batched: `DLSResult`, `RobustResult` or `SlopeDLSResult`.
+
+        Raises:
+            TypeError: as `forward`.
+            ValueError: as `forward`.
+        """
+        fields = self.check(gradient, mask, weight, anchor, anchor_weight)
+        return self.in_units(self.iterate(fields, callback))
