@@ -1,9 +1,10 @@
 """Gain over least squares on every surface: `python benchmarks/gains.py` (add --smoke for a smoke run).
 
-All analytic surfaces and real terrain, several noise levels and draws. SlopeDLS runs as it comes; DLS also as it comes,
-and at the best of a sweep of thresholds, chosen per row with the truth in hand; second-order total variation likewise
-at its best weight. A row is a surface at a noise level: the mean error of least squares over the mean error of the
-method. Writes JSON with every row and a Markdown table of geometric means and worst rows, and a picture.
+All analytic surfaces and real terrain, several noise levels and draws. SlopeDLS runs as it comes. DLS runs as it comes,
+at the best of a sweep of thresholds, chosen per row with the truth in hand, and with `select=True`, which chooses
+without it. The comparators run at the best of a sweep. A row is a surface at a noise level: the mean error of least
+squares over the mean error of the method. Writes JSON with every row and a Markdown table of geometric means and worst
+rows, and a picture.
 """
 
 from __future__ import annotations
@@ -19,7 +20,19 @@ import torch
 from _report import markdown_table, results_folder, write_json
 from torch import Tensor
 
-from torchdls import DLS, SURFACES, GradientOperator, LeastSquares, SlopeDLS, Surface, add_noise, edge_slopes
+from torchdls import (
+    DLS,
+    L1,
+    SURFACES,
+    GradientOperator,
+    LeastSquares,
+    SlopeDLS,
+    SpectralRegularization,
+    Surface,
+    TotalVariation,
+    add_noise,
+    edge_slopes,
+)
 from torchdls.metrics import mean_angular_error, rmse, ssim
 from torchdls.noise import noise_level
 from torchdls.solvers.poisson import solve_direct
@@ -28,6 +41,8 @@ from torchdls.surfaces import terrain
 MEASURES = ("rmse", "1-ssim", "1-ssim, full range", "gradient", "angle")
 THRESHOLDS = (1.0, 1.5, 2.25)  # of DLS, in units of the noise of one sample
 WEIGHTS = (0.25, 0.5, 1.0, 2.0)  # of second-order TV, likewise
+MODES = (8, 16, 24, 32, 48, 64)  # of spectral regularisation
+SMOOTHINGS = (0.1, 1.0, 10.0)  # of TV and L1
 Method = Callable[[Tensor], Tensor]
 
 
@@ -61,7 +76,7 @@ def second_order_tv(gradient: Tensor, weight: float, n_iter: int = 100) -> Tenso
     return z
 
 
-def methods(full: bool) -> dict[str, list[Method]]:
+def methods(full: bool, n: int) -> dict[str, list[Method]]:
     """Each method as its candidates; of several the best counts, per row and measure."""
 
     def dls(mu: float) -> Method:
@@ -73,6 +88,10 @@ def methods(full: bool) -> dict[str, list[Method]]:
         chosen["second-order TV, best of 4"] = [lambda g, w=w: second_order_tv(g, w) for w in WEIGHTS]
         chosen["DLS"] = [DLS(n_iter=15, tol=0)]
         chosen["DLS, best of 3"] = [dls(mu) for mu in THRESHOLDS]
+        chosen["DLS, select"] = [DLS(n_iter=15, tol=0, select=True)]
+        chosen["SR, best of 6"] = [SpectralRegularization(m) for m in MODES if m <= n]
+        chosen["TV, best of 3"] = [TotalVariation(smoothing=s) for s in SMOOTHINGS]
+        chosen["L1, best of 3"] = [L1(smoothing=s) for s in SMOOTHINGS]
     return chosen
 
 
@@ -107,7 +126,7 @@ def run(
         gradient = torch.cat(draws)
         fields += len(gradient)
         plain = measures(LeastSquares()(gradient), surface, len(snrs))
-        for name, candidates in methods(full).items():
+        for name, candidates in methods(full, gradient.shape[-1]).items():
             start = time.perf_counter()
             found = torch.stack([measures(method(gradient), surface, len(snrs)) for method in candidates])
             seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start

@@ -4,9 +4,19 @@ import pytest
 import torch
 from torch import nn
 
-from tests.helpers import assert_unchanged, random_field
+from tests.helpers import assert_unchanged, random_field, seeded
 from tests.test_dls import SMALL, H, W, field
-from torchdls import DLS, Integrator, dct_dictionary, noise_level
+from torchdls import (
+    DLS,
+    SURFACES,
+    Integrator,
+    LeastSquares,
+    TotalVariation,
+    add_noise,
+    dct_dictionary,
+    noise_level,
+    rmse,
+)
 
 
 def test_noise_is_that_of_the_surface_on_oblong_pixels():
@@ -126,3 +136,63 @@ def test_bad_settings_are_named(options, message):
 def test_fields_that_do_not_fit_the_settings_are_named(options, shape, message):
     with pytest.raises(ValueError, match=message):
         DLS(**options)(torch.zeros(shape))
+
+
+def selected(surface, snr, **options):
+    surface = SURFACES[surface](48, dtype=torch.float64)
+    gradient = add_noise(surface.gradient, snr, seeded(2))
+    return surface, gradient, DLS(select=True, n_iter=8, tol=0, z_tol=1e-11, **options).solve(gradient)
+
+
+def test_select_takes_the_threshold_of_the_smaller_error():
+    """On a strongly noisy Tent it raises the threshold, and gains by it."""
+    surface, gradient, found = selected("tent", 1)
+    assert found.mu > 1.2 * found.noise
+    assert found.lam == 0.5
+    plain, default = LeastSquares()(gradient), DLS(n_iter=8, tol=0)(gradient)
+    errors = [float(rmse(z, surface.height)) for z in (found.height, default, plain)]
+    assert errors == sorted(errors)
+    torch.testing.assert_close(DLS(lam=0.5, mu=found.mu, n_iter=8, tol=0, z_tol=1e-11)(gradient), found.height)
+
+
+def test_select_keeps_least_squares_where_nothing_is_to_gain_each_surface_for_itself():
+    _, tent, first = selected("tent", 1)
+    _, fractal, second = selected("fractal", 40)
+    assert second.lam == 0
+    torch.testing.assert_close(second.height, LeastSquares()(fractal), rtol=0, atol=1e-7)
+    both = DLS(select=True, n_iter=8, tol=0, z_tol=1e-11).solve(torch.cat([tent, fractal]))
+    torch.testing.assert_close(both.height, torch.cat([first.height, second.height]), rtol=0, atol=1e-7)
+    assert both.lam.tolist() == [0.5, 0]
+
+
+def test_select_sets_a_given_threshold_against_least_squares():
+    _, _, harmful = selected("tent", 30, mu=5.0)
+    assert harmful.lam == 0
+    _, _, useful = selected("tent", 1, mu=1.5)
+    assert useful.mu == 1.5
+    assert useful.lam == 0.5
+
+
+def test_the_choice_is_held_fixed_in_the_derivative():
+    _, gradient, found = selected("tent", 1)
+    chosen = DLS(lam=0.5, mu=found.mu, n_iter=8, tol=0, z_tol=1e-11)
+    slopes = []
+    for model in (DLS(select=True, n_iter=8, tol=0, z_tol=1e-11), chosen):
+        point = gradient.clone().requires_grad_()
+        model(point).square().sum().backward()
+        slopes.append(point.grad)
+    assert slopes[0].abs().max() > 0
+    torch.testing.assert_close(*slopes)
+
+
+def test_select_refuses_what_it_cannot_predict():
+    g = field()
+    mask = torch.ones(1, 1, H, W, dtype=torch.bool)
+    DLS(**SMALL, select=True)(g, mask)
+    mask[..., 3, 3] = False
+    with pytest.raises(ValueError, match=r"full rectangles.*\(1, 2,"):
+        DLS(**SMALL, select=True)(g, mask)
+    with pytest.raises(ValueError, match="shared"):
+        DLS(**SMALL, select=True, learn="shared")
+    with pytest.raises(ValueError, match="TotalVariation"):
+        DLS(**SMALL, select=True, data_term=TotalVariation())

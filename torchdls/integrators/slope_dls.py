@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchdls._tape import visible
 from torchdls.integrators.base import Fields, edge_cost
+from torchdls.integrators.fields import even, largest
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.outliers import replace_outliers
 from torchdls.integrators.slope_coding import Aggregate, Noise, SlopeScale, average, extend_edges
@@ -206,8 +207,8 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
                 raise ValueError(f"SlopeDLS: sigma {tuple(level.shape)} does not fit {n} surfaces")
             level = level.reshape(-1).expand(n)
         trust = None if weight is None else edge_slopes(gradient, fields.mask, weight)[1]
-        overall = level if weight is None else level * _largest(weight).flatten().clamp(min=1e-30).rsqrt()
-        return Noise(level, trust, overall, _even(fields, weight))
+        overall = level if weight is None else level * largest(weight).flatten().clamp(min=1e-30).rsqrt()
+        return Noise(level, trust, overall, even(fields, weight))
 
     def _from_map(self, sigma: Tensor, fields: Fields) -> tuple[Tensor, Tensor]:
         """Weights and level of a noise map: its root mean square is the level."""
@@ -242,17 +243,3 @@ def _continue(fields: Fields, z: Tensor, w: Tensor | None, tol: float) -> tuple[
     if not visible(held) or not bool(held.all()):
         z = harmonic_extension(z, held, tol=tol, pixel_size=fields.steps)
     return extend_edges(w) > 0, extend_edges(GradientOperator("forward", fields.steps)(z))
-
-
-def _even(fields: Fields, weight: Tensor | None) -> Tensor:
-    """(N, 1, 1, 1) bool: a full rectangle with equal trust and no anchor, where the noise of the height is known."""
-    even = torch.ones_like(fields.gradient[:, :1, :1, :1], dtype=torch.bool)
-    if fields.mask is not None:
-        even = even & (_largest(~fields.mask) == 0)
-    for w in (fields.weight, weight):
-        even = even if w is None else even & (_largest(w) == -_largest(-w))
-    return even if fields.anchor_weight is None else even & (_largest(fields.anchor_weight) == 0)
-
-
-def _largest(x: Tensor) -> Tensor:
-    return x.flatten(1).amax(1)[:, None, None, None]
