@@ -278,7 +278,7 @@ def test_plane_is_exact(make):
     torch.testing.assert_close(result.height, z - z.mean(), rtol=0, atol=1e-9)
 
 
-@robust
+@pytest.mark.parametrize("make", [*ALL.values(), WeightedLeastSquares], ids=[*ALL, "weighted"])
 @pytest.mark.parametrize("mask", [None, "disk"])
 def test_dls_with_it_never_raises_its_objective(make, mask):
     g = add_noise(SURFACES["tent"](24, dtype=torch.float64).gradient, snr_db=8, generator=seeded(0))

@@ -175,6 +175,21 @@ def test_creases_are_not_outliers(name):
     assert flagged.double().mean() < 0.02
 
 
+@pytest.mark.parametrize("snr", [20, 40])
+def test_steep_steps_are_not_outliers(snr):
+    """Narrow cliffs bend more within a pixel than any noise; taken for wrong, they would bring the stairs down."""
+    surface, gradient = noisy("steps", 96, snr)
+    repaired, flagged = replace_outliers(LeastSquares().check(gradient))
+    assert flagged.double().mean() < 0.01
+    plain, kept = (rmse(LeastSquares()(g), surface.height) for g in (gradient, repaired))
+    assert kept < 1.3 * plain
+    wrong = torch.rand(1, 1, 96, 96, generator=seeded(5)) < 0.03
+    damaged = torch.where(wrong, gradient + 4 * random_field(1, 2, 96, 96, seed=6), gradient)
+    repaired, flagged = replace_outliers(LeastSquares().check(damaged))
+    assert (flagged & wrong).sum() > 0.9 * wrong.sum()
+    assert rmse(LeastSquares()(repaired), surface.height) < 0.3 * rmse(LeastSquares()(damaged), surface.height)
+
+
 # Parts
 
 

@@ -13,6 +13,7 @@ from torchdls.solvers import solve
 _LIMITS = (16.0, 12.0, 9.0, 7.0, 6.0, 5.0, 4.0, 4.0)  # robust standard deviations, loop by loop
 _NORMAL_MEDIAN = 0.6744897501960817
 _WITNESSES = 2  # neighbours that must agree with a sample to protect it
+_SPOILT = 2  # neighbours that may be wrong themselves
 
 
 def replace_outliers(fields: Fields, *, tol: float = 1e-5) -> tuple[Tensor, Tensor]:
@@ -26,8 +27,8 @@ def replace_outliers(fields: Fields, *, tol: float = 1e-5) -> tuple[Tensor, Tens
     and the solve direct.
 
     True steps and creases also differ from the smooth surface, but they come in lines: a sample is protected if
-    at least two of its eight neighbours measure the same slope, to within 4 s, in both components. Isolated errors have
-    no such witnesses.
+    at least two of its eight neighbours measure the same slope in both components, to within 4 s or, on a steep bend,
+    to within the spread of the neighbours among themselves. Isolated errors have no such witnesses.
 
     Args:
         fields: checked input of an integrator.
@@ -40,6 +41,7 @@ def replace_outliers(fields: Fields, *, tol: float = 1e-5) -> tuple[Tensor, Tens
     given, a = fields.gradient, GradientOperator("forward", fields.steps)
     inside = torch.ones_like(given[:, :1], dtype=torch.bool) if fields.mask is None else fields.mask
     inside = inside.expand(given.shape[0], -1, -1, -1)
+    nearest, spread = _surroundings(given.detach(), inside)
     present, wrong, z = given, torch.zeros_like(inside), None
     for limit in _LIMITS:
         v, w = edge_slopes(present, fields.mask, fields.weight)
@@ -48,7 +50,7 @@ def replace_outliers(fields: Fields, *, tol: float = 1e-5) -> tuple[Tensor, Tens
         expected = _at_pixels(a(z), fields.mask)
         distance = (given - expected).detach().norm(dim=1, keepdim=True)
         scale = _median(distance, inside) / _NORMAL_MEDIAN / 1.7  # the norm of two components is larger than one
-        wrong = inside & (distance > limit * scale) & ~_witnessed(given.detach(), inside, 4 * scale)
+        wrong = inside & (distance > limit * scale) & (nearest > torch.maximum(4 * scale, spread))
         present = torch.where(wrong, expected, given)
     return present, wrong
 
@@ -74,15 +76,16 @@ def _median(x: Tensor, inside: Tensor) -> Tensor:
     return torch.where(inside, x, torch.nan).flatten(1).nanmedian(1).values[:, None, None, None]
 
 
-def _witnessed(g: Tensor, inside: Tensor, width: Tensor) -> Tensor:
-    """Whether enough of the eight neighbours measure the same slopes."""
+def _surroundings(g: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
+    """How far the second nearest of the eight neighbours' slopes is from a sample's, and how far they spread.
+
+    The distance is the larger one of the two components; the spread is the third largest distance of the neighbours
+    from their median, which two wrong ones do not change. Both (N, 1, H, W).
+    """
     h, w = g.shape[-2:]
-    far = torch.where(inside, g, torch.inf)
-    far = functional.pad(far, (1, 1, 1, 1), value=torch.inf)
-    count = torch.zeros_like(inside, dtype=torch.int64)
-    for i in range(3):
-        for j in range(3):
-            if (i, j) != (1, 1):
-                near = (far[..., i : i + h, j : j + w] - g).abs() <= width
-                count = count + near.all(1, keepdim=True)
-    return count >= _WITNESSES
+    padded = functional.pad(torch.where(inside, g, torch.nan), (1, 1, 1, 1), value=torch.nan)
+    around = [padded[..., i : i + h, j : j + w] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+    near = torch.stack(around, 1)
+    distance = (near - g[:, None]).abs().amax(2).nan_to_num(torch.inf).kthvalue(_WITNESSES, 1).values
+    spread = (near - near.nanmedian(1, keepdim=True).values).abs().amax(2).nan_to_num(0).topk(_SPOILT + 1, 1).values
+    return distance[:, None], spread[:, -1:]
