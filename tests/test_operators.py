@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from tests.helpers import assert_adjoint, assert_gradients, assert_unchanged, random_field
 from tests.helpers.oracles import differences, edge_vector
 from torchdls import GradientOperator, edge_slopes
-from torchdls.operators import as_pixel_size
+from torchdls.operators import as_pixel_size, slope_divergence
 
 SOBEL = (((-1, 0, 1), (-2, 0, 2), (-1, 0, 1)), ((-1, -2, -1), (0, 0, 0), (1, 2, 1)))
 DIAGONAL = (((-1, 0, 0), (0, 0, 0), (0, 0, 1)), ((0, 0, 1), (0, 0, 0), (-1, 0, 0)))
@@ -175,3 +175,15 @@ def test_edge_slopes_are_differentiable_and_ignore_nan_outside():
     edge_slopes(g, mask, t)[0].sum().backward()
     assert g.grad.isfinite().all()
     assert (g.grad[~mask.expand_as(g)] == 0).all()
+
+
+@pytest.mark.parametrize("taped", [False, True])
+@pytest.mark.parametrize("pixel_size", [(1.0, 1.0), (0.5, 3.0)], ids=str)
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (2, 2), (7, 6)], ids=str)
+def test_divergence_is_the_adjoint_of_the_edge_slopes(shape, pixel_size, taped):
+    """With and without a derivative, which are computed differently."""
+    g = random_field(2, 2, *shape)
+    with assert_unchanged(g):
+        b = slope_divergence(g.requires_grad_(taped), pixel_size)
+    expected = GradientOperator("forward", pixel_size).adjoint(edge_slopes(g.detach())[0])
+    torch.testing.assert_close(b.detach(), expected, rtol=0, atol=1e-14)

@@ -14,7 +14,7 @@ from tests.helpers import (
     sparse_solve,
 )
 from torchdls import ConvergenceWarning, SolveResult, edge_slopes, solve
-from torchdls.solvers import conjugate_gradients, harmonic_extension, solve_direct
+from torchdls.solvers import conjugate_gradients, direct, harmonic_extension, integrate_direct, solve_direct
 
 SHAPES = [(1, 1), (1, 7), (6, 1), (2, 2), (9, 8), (70, 66)]
 PIXELS = [(1.0, 1.0), (0.5, 3.0)]
@@ -242,6 +242,20 @@ def test_solve_direct_inverts_the_shifted_laplacian():
     )
     x = solve_direct(b, 0.7, (2.0, 1.0))
     np.testing.assert_allclose(H @ x.numpy().reshape(2, -1).T, b.numpy().reshape(2, -1).T, atol=1e-12)
+
+
+@pytest.mark.parametrize("taped", [False, True])
+def test_large_batches_are_integrated_a_few_at_a_time(taped, monkeypatch):
+    """The parts come out in order, whether a derivative is recorded or not."""
+    monkeypatch.setattr(direct, "_IN_CACHE", 2 * 70 * 66)
+    g = random_field(5, 2, 70, 66).requires_grad_(taped)
+    z = integrate_direct(g, (0.5, 3.0))
+    assert_solves(z, edge_slopes(g.detach())[0], None, pixel_size=(0.5, 3.0), atol=1e-11)
+    if taped:
+        c = random_field(5, 1, 70, 66, seed=1)
+        (slope,) = torch.autograd.grad((c * z).sum(), g)
+        e = random_field(5, 2, 70, 66, seed=2)
+        torch.testing.assert_close((slope * e).sum(), (c * integrate_direct(e, (0.5, 3.0))).sum())
 
 
 def test_conjugate_gradients_on_dense_systems():

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from torchdls.integrators.base import Fields, Integrator
 from torchdls.integrators.dirichlet import solve_dirichlet
-from torchdls.operators import slope_divergence
-from torchdls.solvers import SolveResult, direct_result, solve
+from torchdls.solvers import SolveResult, direct_result, integrate_direct, solve
 
 
 class LeastSquares(Integrator):
@@ -66,7 +65,7 @@ class LeastSquares(Integrator):
         if self.boundary == "dirichlet":
             return solve_dirichlet(fields, tol=self.tol, max_iter=self.max_iter, z0=z0)
         if fields.mask is None and fields.weight is None and fields.anchor is None:
-            return direct_result(slope_divergence(fields.gradient, fields.steps), None, fields.steps)
+            return direct_result(integrate_direct(fields.gradient, fields.steps))
         v, w = self.edges(fields)
         return solve(
             v,

@@ -75,8 +75,9 @@ def half_spectrum(x: Tensor) -> Tensor:
 def from_half_spectrum(spectrum: Tensor, size: tuple[int, int]) -> Tensor:
     """Inverse of `half_spectrum`; overwrites its argument."""
     h, w = size
-    y = torch.fft.irfft2(spectrum.mul_(_rotation_back(h, w, like=spectrum.real)), s=size)
-    return _restored(y)
+    spectrum.mul_(_rotation_back(h, w, like=spectrum.real))
+    # In two steps, since irfft2 copies its argument first; the scale is in the rotation.
+    return _restored(torch.fft.irfft2(spectrum, s=size, norm="forward"))
 
 
 def mirrored(spectrum: Tensor) -> Tensor:
@@ -128,7 +129,7 @@ def _rotation(h: int, w: int) -> Tensor:
 
 @table
 def _rotation_back(h: int, w: int) -> Tensor:
-    return (_phase(h, h)[:, None] * _phase(w, w // 2 + 1)).conj().resolve_conj()
+    return (_phase(h, h)[:, None] * _phase(w, w // 2 + 1)).conj().resolve_conj() / (h * w)
 
 
 @table
@@ -149,22 +150,34 @@ def _inverse_twiddle(h: int, w: int) -> Tensor:
     return (_phase(h, h)[:, None] * _phase(w, w // 2 + 1)).conj() / weight
 
 
+@table
+def _order(h: int, w: int) -> Tensor:
+    """(H W,) positions of the pixels with rows and columns in the order 0 2 4 .. 5 3 1.
+
+    In this order an FFT of the same length gives the DCT.
+    """
+    rows, columns = (torch.cat([k[::2], k[1::2].flip(0)]) for k in (torch.arange(n, device="cpu") for n in (h, w)))
+    return (rows[:, None] * w + columns).flatten()
+
+
+@table
+def _order_back(h: int, w: int) -> Tensor:
+    return _order(h, w, like=torch.empty(0, device="cpu")).argsort()
+
+
 def _reordered(x: Tensor) -> Tensor:
-    """Along both dimensions x0 x2 x4 .. x5 x3 x1: the order in which an FFT of the same length gives the DCT."""
-    (h, w), y = x.shape[-2:], torch.empty_like(x, memory_format=torch.contiguous_format)
-    for rows, i in (slice(0, (h + 1) // 2), 0), (slice((h + 1) // 2, h), 1):
-        for columns, j in (slice(0, (w + 1) // 2), 0), (slice((w + 1) // 2, w), 1):
-            y[..., rows, columns] = x[..., i::2, j::2].flip([d for d, odd in ((-2, i), (-1, j)) if odd])
-    return y
+    return _gathered(x, _order(*x.shape[-2:], like=x))
 
 
 def _restored(y: Tensor) -> Tensor:
     """Inverse of `_reordered`."""
-    (h, w), x = y.shape[-2:], torch.empty_like(y)
-    for rows, i in (slice(0, (h + 1) // 2), 0), (slice((h + 1) // 2, h), 1):
-        for columns, j in (slice(0, (w + 1) // 2), 0), (slice((w + 1) // 2, w), 1):
-            x[..., i::2, j::2] = y[..., rows, columns].flip([d for d, odd in ((-2, i), (-1, j)) if odd])
-    return x
+    return _gathered(y, _order_back(*y.shape[-2:], like=y))
+
+
+def _gathered(x: Tensor, positions: Tensor) -> Tensor:
+    """The pixels of every image at these positions; several times faster than strided copies."""
+    flat = x.flatten(-2)
+    return flat.gather(-1, positions.expand(flat.shape)).view(x.shape)
 
 
 def _negate_rows(v: Tensor) -> Tensor:

@@ -11,6 +11,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls._tape import recorded
+
 Kernel = tuple[tuple[float, ...], ...]
 
 _TAPS: dict[str, tuple[float, ...]] = {
@@ -236,7 +238,14 @@ def slope_divergence(gradient: Tensor, pixel_size: tuple[float, float] = (1.0, 1
         (A^T v)_j = (g_{j-1} - g_{j+1}) / 2 dx + (the same along y),     g_{-1} = -g_0,  g_W = -g_{W-1}
     """
     (gx, gy), (dx, dy) = gradient.split(1, -3), pixel_size
-    return torch.add(_central(gx, -1) * (0.5 / dx), _central(gy, -2), alpha=0.5 / dy)
+    if recorded(gradient):
+        return torch.add(_central(gx, -1) * (0.5 / dx), _central(gy, -2), alpha=0.5 / dy)
+    divergence = torch.zeros_like(gx, memory_format=torch.contiguous_format)
+    for g, dim, half in ((gx, -1, 0.5 / dx), (gy, -2, 0.5 / dy)):
+        n = g.shape[dim]
+        for at, of, count, sign in ((1, 0, n - 1, 1), (0, 1, n - 1, -1), (0, 0, 1, -1), (n - 1, n - 1, 1, 1)):
+            divergence.narrow(dim, at, count).add_(g.narrow(dim, of, count), alpha=sign * half)
+    return divergence
 
 
 def _central(g: Tensor, dim: int) -> Tensor:

@@ -20,8 +20,8 @@ def table(build: Callable[..., Tensor], maxsize: int = 64) -> Callable[..., Tens
     def make(args: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
         with torch.inference_mode(False), torch.no_grad():
             values = build(*args)
-            if values.is_complex():
-                dtype = dtype.to_complex()
+            if not values.is_floating_point():  # positions stay integers
+                dtype = dtype.to_complex() if values.is_complex() else values.dtype
             return values.to(dtype).to(device)
 
     cached = lru_cache(maxsize)(make)

@@ -7,14 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdls._tape import visible
-from torchdls.operators import dct2, idct2, neumann_eigenvalues
+from torchdls._tape import recorded, visible
+from torchdls.operators import dct2, idct2, neumann_eigenvalues, slope_divergence
 from torchdls.operators.cosine import MATRIX_LIMIT, from_half_spectrum, half_spectrum, mirrored
 from torchdls.operators.tables import table
 from torchdls.solvers.cg import LinearMap
 
 # Pixels of small surfaces that are transformed together: they stay in the cache from one pass to the next.
-_IN_CACHE = 2**17
+_IN_CACHE = 2**18
 
 
 def solve_direct(b: Tensor, r: Tensor | float | None, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
@@ -33,6 +33,24 @@ def solve_direct(b: Tensor, r: Tensor | float | None, pixel_size: tuple[float, f
     return _Direct.apply(b, r, pixel_size)
 
 
+def integrate_direct(gradient: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
+    """argmin_z ||A z - v||^2 (N, 1, H, W) for the slopes v = `edge_slopes(gradient)` of full rectangles, mean 0."""
+    return _few_at_a_time(lambda g: solve_direct(slope_divergence(g, pixel_size), None, pixel_size), gradient)
+
+
+def _few_at_a_time(height: LinearMap, x: Tensor) -> Tensor:
+    """Heights (N, 1, H, W) of a batch x (N, C, H, W), as many surfaces at once as stay in the cache."""
+    several = max(1, _IN_CACHE // (x.shape[-2] * x.shape[-1]))
+    if len(x) <= several:
+        return height(x)
+    if recorded(x):
+        return torch.cat([height(part) for part in x.split(several)])
+    result = torch.empty_like(x[:, :1], memory_format=torch.contiguous_format)
+    for part, piece in zip(x.split(several), result.split(several), strict=True):
+        piece.copy_(height(part))
+    return result
+
+
 def direct_map(size: tuple[int, int], r: Tensor | None, pixel_size: tuple[float, float], like: Tensor) -> LinearMap:
     """The map b -> (A^T A + r)^{-1} b for repeated use: its gains are computed once."""
     if max(size) <= MATRIX_LIMIT:
@@ -48,14 +66,8 @@ def direct_map(size: tuple[int, int], r: Tensor | None, pixel_size: tuple[float,
         values.mul_(own)[..., 1:, :, :].addcmul_(opposite, other, value=-1)
         return from_half_spectrum(spectrum, size)
 
-    several = max(1, _IN_CACHE // (size[0] * size[1]))
     alike = own.ndim == 3 or len(own) == 1  # one table for all surfaces
-
-    def apply(b: Tensor) -> Tensor:
-        parts = b.split(several) if alike else (b,)
-        return torch.cat([solve_part(part) for part in parts]) if len(parts) > 1 else solve_part(b)
-
-    return apply
+    return (lambda b: _few_at_a_time(solve_part, b)) if alike else solve_part
 
 
 def _inverse(eigenvalues: Tensor) -> Tensor:

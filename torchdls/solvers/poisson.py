@@ -98,15 +98,14 @@ def solve(
     if r is not None and anchor is not None:
         b = b + r * anchor
     if w is None and (r is None or r[0].numel() == 1):
-        return direct_result(b, r, setting.pixel_size)
+        return direct_result(solve_direct(b, r, setting.pixel_size))
     w = present_edges(v) if w is None else w.expand_as(v)
     r = torch.zeros_like(b) if r is None else r.expand_as(b)
     return SolveResult(*_Solve.apply(b, w, r, z0, None, None, setting)[:4])
 
 
-def direct_result(b: Tensor, r: Tensor | None, pixel_size: tuple[float, float]) -> SolveResult:
-    """`solve_direct` as a result of `solve`."""
-    z = solve_direct(b, r, pixel_size)
+def direct_result(z: Tensor) -> SolveResult:
+    """What a direct solve gave, as a result of `solve`."""
     zeros = torch.zeros(z.shape[0], dtype=z.dtype, device=z.device)
     return SolveResult(z, zeros.long(), zeros, zeros == 0)
 
