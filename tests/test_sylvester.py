@@ -201,6 +201,35 @@ def test_derivative_in_the_prior():
     assert torch.autograd.gradcheck(lambda p: TikhonovRegularization()(g, prior=p), z0)
 
 
+@pytest.mark.parametrize("order", [0, 1, 2])
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_derivatives_in_lam(order, with_prior):
+    """First, second and mixed derivatives, reverse and forward, also through function transforms."""
+    g, z0 = noise(1, 2, 5, 6).requires_grad_(), noise(1, 1, 5, 6, seed=1) if with_prior else None
+    lam = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+
+    def height(g, lam):
+        return torch.func.functional_call(method, {"lam": lam}, (g,), {"prior": z0})
+
+    method = TikhonovRegularization(torch.nn.Parameter(lam.detach()), order)
+    assert torch.autograd.gradcheck(height, (g, lam), check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(height, (g, lam))
+    expected = torch.autograd.functional.jacobian(lambda lam: height(g, lam), lam)
+    torch.testing.assert_close(torch.func.jacrev(height, 1)(g, lam), expected)
+    torch.testing.assert_close(torch.func.jacfwd(height, 1)(g, lam), expected)
+    torch.testing.assert_close(method(g, prior=z0), TikhonovRegularization(0.3, order)(g, prior=z0))
+
+
+def test_lam_is_trained_or_kept_with_the_module():
+    g = noise(1, 2, 9, 8)
+    trained = TikhonovRegularization(torch.nn.Parameter(torch.tensor(0.2)))
+    trained(g).square().sum().backward()
+    assert trained.lam.grad < 0
+    kept = TikhonovRegularization(torch.tensor(0.2, dtype=torch.float64))
+    assert "lam" in kept.state_dict()
+    torch.testing.assert_close(kept(g), TikhonovRegularization(0.2)(g))
+
+
 @pytest.mark.parametrize("method", METHODS, ids=str)
 def test_single_precision(method):
     g = noise(2, 2, 40, 33)
@@ -250,6 +279,7 @@ def test_refuses_what_it_cannot_honour(method):
         (lambda: SpectralRegularization(basis="haar"), "basis='haar'"),
         (lambda: SpectralRegularization(10)(noise(2, 9, 12)), "modes=10 given for 9 rows"),
         (lambda: TikhonovRegularization(-1.0), "lam=-1.0"),
+        (lambda: TikhonovRegularization(torch.ones(2)), "lam=tensor"),
         (lambda: TikhonovRegularization(order=3), "order=3"),
     ],
 )

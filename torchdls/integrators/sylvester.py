@@ -3,26 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, cast
+from typing import cast
 
 import torch
-import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
-from torchdls._tape import bool_all
+from torchdls._tape import bool_all, recorded
+from torchdls.integrators.axis_modes import BASES, Basis, Modes, axis_modes, expand
 from torchdls.integrators.base import Integrator
 from torchdls.integrators.fields import Fields, fit_field
-from torchdls.operators.local_polynomials import (
-    build_derivative,
-    cosine_basis,
-    derivative_matrix,
-    polynomial_basis,
-)
-from torchdls.operators.tables import table
-
-Basis = Literal["cosine", "polynomial"]
-_BASES = {"cosine": cosine_basis, "polynomial": polynomial_basis}
-_ZERO = 1e-12  # an eigenvalue below this part of the largest one is 0: D has lost that mode
+from torchdls.operators.local_polynomials import derivative_matrix
 
 
 class GlobalLeastSquares(Integrator):
@@ -65,9 +55,7 @@ class GlobalLeastSquares(Integrator):
         rows = self.modes_of(h, dy, -2, gx)
         columns = self.modes_of(w, dx, -1, gx)
         right = columns.project(rows.project_slopes(gy)) + rows.project(columns.project_slopes(gx))
-        total = rows.eigenvalues[:, None] + columns.eigenvalues
-        coefficients = right / total.masked_fill(total == 0, torch.inf)
-        return rows.expand(columns.expand(coefficients))
+        return expand(right, rows, columns)
 
 
 class HarkerOLeary(GlobalLeastSquares):
@@ -144,8 +132,8 @@ class SpectralRegularization(GlobalLeastSquares):
         if len(pair) != 2 or not all(_is_count(m) for m in pair):
             wanted = "an integer of at least 1, a float in (0, 1], or a pair (rows, columns) of them"
             raise ValueError(f"SpectralRegularization: modes={modes!r} given, {wanted} is needed")
-        if basis not in _BASES:
-            raise ValueError(f"SpectralRegularization: basis={basis!r} is unknown; choose from {', '.join(_BASES)}")
+        if basis not in BASES:
+            raise ValueError(f"SpectralRegularization: basis={basis!r} is unknown; choose from {', '.join(BASES)}")
         self.modes = pair
         self.basis = basis
 
@@ -176,7 +164,8 @@ class TikhonovRegularization(GlobalLeastSquares):
     On the constant: zero mean, or the mean of the prior.
 
     Args:
-        lam: strength of the penalty, at least 0.
+        lam: strength of the penalty, at least 0: a number, or a tensor with one element. An `nn.Parameter` is trained
+            with the module; its first and second derivatives are exact.
         order: of the derivative that is penalised: 0 (heights), 1 (slopes) or 2 (second derivatives). Order 0 pulls
             the surface down and order 1 flattens it by 1/(1 + lam), planes included; order 2 leaves planes exact.
         support: samples of each local polynomial of the derivative, odd, at least 3.
@@ -189,9 +178,11 @@ class TikhonovRegularization(GlobalLeastSquares):
     Source: Harker, O'Leary (2015), as in `SpectralRegularization`.
     """
 
+    lam: float | Tensor
+
     def __init__(
         self,
-        lam: float = 0.05,
+        lam: float | Tensor = 0.05,
         order: int = 2,
         support: int = 3,
         degree: int | None = None,
@@ -199,16 +190,41 @@ class TikhonovRegularization(GlobalLeastSquares):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(support, degree, pixel_size)
-        if not isinstance(lam, int | float) or not 0 <= lam < float("inf"):
-            raise ValueError(f"TikhonovRegularization: lam={lam!r} given, a number of at least 0 is needed")
+        single = isinstance(lam, int | float) or (isinstance(lam, Tensor) and lam.numel() == 1)
+        if not single or not 0 <= _number(lam) < float("inf"):
+            raise ValueError(f"TikhonovRegularization: lam={lam!r} given, one number of at least 0 is needed")
         if order not in (0, 1, 2):
             raise ValueError(f"TikhonovRegularization: order={order!r} given, 0, 1 or 2 is needed")
-        self.lam = float(lam)
+        if isinstance(lam, Tensor) and not isinstance(lam, nn.Parameter):
+            self.register_buffer("lam", lam.detach().clone())
+        else:
+            self.lam = lam
         self.order = order
 
     def modes_of(self, n: int, step: float, dim: int, like: Tensor) -> Modes:
         """The eigenvectors of D^T D + lam S^T S."""
-        return axis_modes(n, step, dim, self.support, self.degree, "cosine", n, self.lam, self.order, like=like)
+        lam = _number(self.lam)
+        return axis_modes(n, step, dim, self.support, self.degree, "cosine", n, lam, self.order, like=like)
+
+    def integrate(self, fields: Fields) -> Tensor:
+        """Height (N, 1, H, W) in pixels.
+
+        The modes belong to one value of lam. Where its derivative is asked for, the change d of lam enters by the
+        series z - d H^-1 R z + d^2 (H^-1 R)^2 z, with H the system at d = 0 and R z the derivative of the penalty.
+        """
+        z = super().integrate(fields)
+        if not isinstance(self.lam, Tensor) or not recorded(self.lam):
+            return z
+        (h, w), (dx, dy) = z.shape[-2:], fields.steps
+        rows, columns = self.modes_of(h, dy, -2, z), self.modes_of(w, dx, -1, z)
+
+        def change(x: Tensor) -> Tensor:
+            slope_x, slope_y = self._powers(x, fields.steps)
+            return expand(rows.project(columns.project(slope_x + slope_y)), rows, columns)
+
+        d = (self.lam - self.lam.detach()).to(z).reshape(())
+        first = change(z)
+        return z - d * first + d.square() * change(first)
 
     def forward(
         self,
@@ -258,112 +274,24 @@ class TikhonovRegularization(GlobalLeastSquares):
         rows = derivative_matrix(h, self.support, self.degree, dy, like=z)
         return torch.cat([z @ columns.mT, rows @ z], -3)
 
+    def _powers(self, z: Tensor, steps: tuple[float, float]) -> tuple[Tensor, Tensor]:
+        """Z S_x^T S_x and S_y^T S_y Z."""
+        (h, w), (dx, dy) = z.shape[-2:], steps
+        columns = derivative_matrix(w, self.support, self.degree, dx, like=z).matrix_power(self.order)
+        rows = derivative_matrix(h, self.support, self.degree, dy, like=z).matrix_power(self.order)
+        return z @ columns.mT @ columns, rows.mT @ (rows @ z)
+
     def extra_repr(self) -> str:
         """The settings, as `print` shows them."""
         shape = f"support={self.support}, degree={self.degree}"
-        return f"lam={self.lam:g}, order={self.order}, {shape}, pixel_size={self.pixel_size}"
-
-
-class Modes(NamedTuple):
-    """Eigenvectors of the rows or the columns: first the even ones, then the odd ones, each by its first half.
-
-    Attributes:
-        vectors: (ceil(n / 2), k), the upper half of U.
-        slopes: (ceil(n / 2), k), the upper half of D U, odd where U is even and even where it is odd.
-        eigenvalues: (k,), at least 0.
-        n: rows or columns of the image.
-        dim: -2 for rows, -1 for columns: the dimension that the maps below act on.
-    """
-
-    vectors: Tensor
-    slopes: Tensor
-    eigenvalues: Tensor
-    n: int
-    dim: int
-
-    def project(self, x: Tensor) -> Tensor:
-        """U^T x: n pixels -> k coefficients."""
-        return self._apply(self.vectors.mT, *self._fold(x))
-
-    def project_slopes(self, x: Tensor) -> Tensor:
-        """(D U)^T x: n pixels -> k coefficients."""
-        even, odd = self._fold(x)
-        return self._apply(self.slopes.mT, odd, even)
-
-    def expand(self, c: Tensor) -> Tensor:
-        """U c: k coefficients -> n pixels."""
-        count = (c.shape[self.dim] + 1) // 2
-        even = self._multiply(self.vectors[:, :count], c.narrow(self.dim, 0, count))
-        odd = self._multiply(self.vectors[:, count:], c.narrow(self.dim, count, c.shape[self.dim] - count))
-        return torch.cat([even + odd, (even - odd).narrow(self.dim, 0, self.n // 2).flip(self.dim)], self.dim)
-
-    def _fold(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Sum and difference of the first half and the mirrored second half; a middle pixel counts once."""
-        half = self.vectors.shape[0]
-        first, second = x.narrow(self.dim, 0, half), x.narrow(self.dim, half, self.n - half).flip(self.dim)
-        if self.n % 2:
-            second = F.pad(second, (0, 1) if self.dim == -1 else (0, 0, 0, 1))
-        return first + second, first - second
-
-    def _apply(self, transposed: Tensor, first: Tensor, second: Tensor) -> Tensor:
-        """The even modes' rows of a matrix times one field, the odd modes' times the other."""
-        count = (transposed.shape[0] + 1) // 2
-        parts = self._multiply(transposed[:count], first), self._multiply(transposed[count:], second)
-        return torch.cat(parts, self.dim)
-
-    def _multiply(self, matrix: Tensor, x: Tensor) -> Tensor:
-        return matrix @ x if self.dim == -2 else x @ matrix.mT
-
-
-def axis_modes(
-    n: int,
-    step: float,
-    dim: int,
-    support: int,
-    degree: int,
-    basis: Basis,
-    count: int,
-    lam: float,
-    order: int,
-    *,
-    like: Tensor,
-) -> Modes:
-    """Eigenvectors of D^T D + lam (D^order)^T D^order in the span of the first `count` vectors of a basis."""
-    packed = _packed_modes(n, step, support, degree, basis, count, lam, order, like=like)
-    half = (n + 1) // 2
-    return Modes(packed[:half], packed[half : 2 * half], packed[-1], n, dim)
-
-
-def _build_modes(
-    n: int, step: float, support: int, degree: int, basis: Basis, count: int, lam: float, order: int
-) -> Tensor:
-    """(2 ceil(n / 2) + 1, count): the three fields of `Modes`, one under the other.
-
-    The constant is an eigenvector for certain, so it is taken out first and stays exact.
-    """
-    D = build_derivative(n, support, degree, step)
-    B = _BASES[basis](n, count)
-    constant = B[:, :1]
-    parts = [(constant, constant.new_full((1,), lam if order == 0 else 0.0))]
-    parts += [_eigenvectors(D, block, lam, order) for block in (B[:, 2::2], B[:, 1::2])]
-    U, s = torch.cat([p[0] for p in parts], 1), torch.cat([p[1] for p in parts])
-    s = torch.where(s > _ZERO * s.max(), s, 0)
-    half = (n + 1) // 2
-    return torch.cat([U[:half], (D @ U)[:half], s[None]])
-
-
-def _eigenvectors(D: Tensor, B: Tensor, lam: float, order: int) -> tuple[Tensor, Tensor]:
-    powers = [B, D @ B]
-    powers += [D @ powers[-1]]
-    gram = powers[1].mT @ powers[1] + lam * powers[order].mT @ powers[order]
-    s, Q = torch.linalg.eigh(gram)
-    return B @ Q, s
-
-
-_packed_modes = table(_build_modes, maxsize=16)  # these tables are large
+        return f"lam={_number(self.lam):g}, order={self.order}, {shape}, pixel_size={self.pixel_size}"
 
 
 def _is_count(modes: object) -> bool:
     if isinstance(modes, bool):
         return False
     return (isinstance(modes, int) and modes >= 1) or (isinstance(modes, float) and 0 < modes <= 1)
+
+
+def _number(lam: float | Tensor) -> float:
+    return float(lam.detach() if isinstance(lam, Tensor) else lam)
