@@ -205,7 +205,7 @@ def test_derivative_in_the_prior():
 @pytest.mark.parametrize("with_prior", [False, True])
 def test_derivatives_in_lam(order, with_prior):
     """First, second and mixed derivatives, reverse and forward, also through function transforms."""
-    g, z0 = noise(1, 2, 5, 6).requires_grad_(), noise(1, 1, 5, 6, seed=1) if with_prior else None
+    g, z0 = noise(1, 2, 4, 3).requires_grad_(), noise(1, 1, 4, 3, seed=1) if with_prior else None
     lam = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
 
     def height(g, lam):
@@ -213,7 +213,7 @@ def test_derivatives_in_lam(order, with_prior):
 
     method = TikhonovRegularization(torch.nn.Parameter(lam.detach()), order)
     assert torch.autograd.gradcheck(height, (g, lam), check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(height, (g, lam))
+    assert torch.autograd.gradgradcheck(height, (g, lam), fast_mode=True)
     expected = torch.autograd.functional.jacobian(lambda lam: height(g, lam), lam)
     torch.testing.assert_close(torch.func.jacrev(height, 1)(g, lam), expected)
     torch.testing.assert_close(torch.func.jacfwd(height, 1)(g, lam), expected)
