@@ -85,6 +85,7 @@ def methods(full: bool, n: int) -> dict[str, list[Method]]:
     chosen: dict[str, list[Method]] = {"SlopeDLS": [SlopeDLS()], "SlopeDLS.fast": [SlopeDLS.fast()]}
     if full:
         chosen["SlopeDLS, learn=False"] = [SlopeDLS(learn=False)]
+        chosen["SlopeDLS, guard='sure'"] = [SlopeDLS(guard="sure")]
         chosen["second-order TV, best of 4"] = [lambda g, w=w: second_order_tv(g, w) for w in WEIGHTS]
         chosen["DLS"] = [DLS(n_iter=15, tol=0)]
         chosen["DLS, best of 3"] = [dls(mu) for mu in THRESHOLDS]
