@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -50,7 +51,10 @@ def comparison(path: Path, name: str, snr: int, n: int, row: dict[str, Any], col
         if label in best:
             title += f"  {float(torchdls.ssim(z, surface.height, surface.data_range)):.3f} ({best[label]:.3f})"
         relief = figure.add_subplot(2, len(panels), i + 1, projection="3d")
-        relief.plot_surface(x, -y, z[0, 0, ::every, ::every].numpy(), cmap="gray", rcount=100, ccount=100, linewidth=0)
+        relief.plot_surface(
+            x, -y, z[0, 0, ::every, ::every].numpy(),
+            color="1.0", lightsource=LightSource(200, 40), rcount=100, ccount=100, linewidth=0, antialiased=False,
+        )  # fmt: skip
         relief.set_title(title, fontsize=10)
         relief.set_axis_off()
         shade = figure.add_subplot(2, len(panels), len(panels) + i + 1)
