@@ -160,6 +160,17 @@ def table(rows: list[dict[str, Any]], seconds: dict[str, float]) -> str:
     return markdown_table(["gain", "up to 20 dB", *(f"{s} dB" for s in snrs), "worst row"], lines) + "\n" + note + "\n"
 
 
+def surface_table(rows: list[dict[str, Any]], method: str = "SlopeDLS") -> str:
+    """The gain of one method on every surface (RMSE / 1-SSIM at the surface's data range)."""
+    snrs = sorted({r["snr"] for r in rows})
+    found = {(r["surface"], r["snr"]): r for r in rows if r["method"] == method}
+    lines = [
+        [name, *(f"{found[name, s]['rmse']:.2f} / {found[name, s]['1-ssim']:.2f}" for s in snrs)]
+        for name in dict.fromkeys(r["surface"] for r in rows)
+    ]
+    return markdown_table([f"gain of {method}", *(f"{s} dB" for s in snrs)], lines)
+
+
 def picture(rows: list[dict[str, Any]], path: Path) -> None:
     """Gain against the noise level: the geometric mean of all surfaces, and every surface for SlopeDLS."""
     import matplotlib
@@ -201,7 +212,7 @@ def main() -> None:
     out = args.out or results_folder(args.smoke)
     settings = {"size": n, "snr": snrs, "seeds": [*seeds]}
     path = write_json(out / "gains.json", settings=settings, seconds=seconds, rows=rows)
-    (out / "gains.md").write_text(table(rows, seconds))
+    (out / "gains.md").write_text(table(rows, seconds) + "\n" + surface_table(rows))
     picture(rows, out / "gains.png")
     print(table(rows, seconds), *(f"{name}: {s:.2f} s per field" for name, s in seconds.items()), sep="\n")
     print(f"written: {path}")
