@@ -50,10 +50,25 @@ def test_absent_edges_join_nothing():
     assert connected_components(linked).flatten().tolist() == list(range(9))
 
 
-def test_gauge_removes_the_mean_of_every_free_component():
-    w = (torch.rand(2, 2, 9, 8, generator=seeded(3)) < 0.5).double()
+def fields_for_gauge(kind):
+    w = torch.zeros(2, 2, 9, 8, dtype=torch.float64)
     r = torch.zeros(2, 1, 9, 8, dtype=torch.float64)
-    r[0, 0, 4, 4] = 2.0
+    if kind == "one component and lone pixels":
+        w[0, :, 2:7, 1:5] = w[1, :, :4, 3:6] = 1
+    elif kind == "lone pixels alone":
+        w[0, :, 2:7, 1:5] = 1
+    else:
+        w = (torch.rand(2, 2, 9, 8, generator=seeded(3)) < 0.5).double()
+    if kind == "many components, one held":
+        r[0, 0, 4, 4] = 2.0
+    return w, r
+
+
+@pytest.mark.parametrize(
+    "kind", ["one component and lone pixels", "lone pixels alone", "many components", "many components, one held"]
+)
+def test_gauge_removes_the_mean_of_every_free_component(kind):
+    w, r = fields_for_gauge(kind)
     x = random_field(2, 1, 9, 8)
     y = free_constants(w, r).remove(x)
     labels = connected_components(w > 0)

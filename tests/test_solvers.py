@@ -83,6 +83,29 @@ def test_weights_that_jump_by_orders_of_magnitude():
     assert_solves(solve(v, w, tol=1e-12, max_iter=2000).height, v, w, atol=1e-6)
 
 
+@pytest.mark.parametrize("dtype, tol", [(torch.float32, 1e-5), (torch.float64, 1e-10)], ids=str)
+@pytest.mark.parametrize("mask", ["full", "disk"])
+def test_random_weights_cost_few_iterations(mask, dtype, tol):
+    """Followed pixel by pixel, such weights would make the preconditioner worse than none: hundreds of iterations."""
+    h, w = 100, 90
+    inside = torch.ones(1, 1, h, w, dtype=torch.bool) if mask == "full" else MASKS[mask](h, w)
+    weight = 0.1 + 0.9 * torch.rand(1, 1, h, w, dtype=torch.float64, generator=seeded(1))
+    v, w_e = edge_slopes(random_field(1, 2, h, w), inside, weight)
+    result = solve(v.to(dtype), w_e.to(dtype), tol=tol)
+    assert int(result.iterations) < 50
+    assert result.height.dtype == dtype
+    assert_solves(result.height.double(), v, w_e, atol=1e-3 if dtype == torch.float32 else 1e-8)
+
+
+def test_weights_that_change_slowly_by_orders_of_magnitude():
+    y, x = torch.meshgrid(torch.linspace(0, 3, 80), torch.linspace(0, 3, 70), indexing="ij")
+    weight = (10 ** (2 * torch.sin(x) * torch.cos(y)))[None, None].double()
+    v, w = edge_slopes(random_field(1, 2, 80, 70), None, weight)
+    result = solve(v, w, tol=1e-10)
+    assert int(result.iterations) < 80
+    assert_solves(result.height, v, w)
+
+
 def test_weights_of_zero_cut_the_surface_apart():
     weight = torch.ones(1, 1, 12, 14, dtype=torch.float64)
     weight[..., 6:8] = 0  # two columns: the edges between them are dead, the outer ones are one-sided

@@ -33,7 +33,8 @@ def conjugate_gradients(
     """Solve H x = b for every system of the batch.
 
     Args:
-        apply: x -> H x, symmetric positive semidefinite on each system; b must lie in its range.
+        apply: x -> H x, symmetric positive semidefinite on each system; b must lie in its range. What it returns must
+            be a tensor of its own, as x is overwritten.
         precondition: an approximate inverse, symmetric positive definite on that range.
         b: (N, ...) right-hand sides.
         x0: (N, ...) warm start, or None for 0.
@@ -59,11 +60,11 @@ def conjugate_gradients(
             break
         y = precondition(r)
         rho_new = _dot(r, y)
-        p = y + _ratio(rho_new, rho, iterations > 0) * p
+        p.mul_(_ratio(rho_new, rho, iterations > 0, p)).add_(y)  # in place: new memory costs as much as the arithmetic
         q = apply(p)
-        step = _ratio(rho_new, _dot(p, q), active)
-        x += step * p
-        r -= step * q
+        step = _ratio(rho_new, _dot(p, q), active, p)
+        x.addcmul_(p, step)
+        r.addcmul_(q, step, value=-1)
         r = r if project is None else project(r)
         rho = rho_new
         iterations += active
@@ -80,7 +81,7 @@ def _norm(a: Tensor) -> Tensor:
     return a.flatten(1).norm(dim=1)
 
 
-def _ratio(a: Tensor, b: Tensor, where: Tensor) -> Tensor:
-    """a / b where `where` holds and b is not 0, else 0; shaped (N, 1, 1, 1) to scale a field."""
+def _ratio(a: Tensor, b: Tensor, where: Tensor, like: Tensor) -> Tensor:
+    """a / b where `where` holds and b is not 0, else 0; shaped to scale the systems of `like`."""
     good = where & (b != 0)
-    return torch.where(good, a / torch.where(good, b, 1), 0)[:, None, None, None]
+    return torch.where(good, a / torch.where(good, b, 1), 0).view(-1, *[1] * (like.ndim - 1))

@@ -14,8 +14,10 @@ class Gauge(NamedTuple):
     """The null space of (*): one constant on every connected component that no anchor holds.
 
     Attributes:
-        labels: (N, H * W) int64, the same number on all pixels of a component; (N, 0) where anchors hold every pixel.
-        share: (N, H * W), 1 / size of the pixel's component, or 0 where an anchor fixes its height; (N, 0) likewise.
+        labels: (N, H * W) int64, the same number on all pixels of a component; (N, 0) where every surface is at most
+            one free component and lone pixels, as most masks are.
+        share: (N, H * W), 1 / size of the pixel's component, or 0 where an anchor fixes its height (and, without
+            labels, on lone pixels); (N, 0) where anchors hold every pixel.
     """
 
     labels: Tensor
@@ -23,9 +25,12 @@ class Gauge(NamedTuple):
 
     def remove(self, x: Tensor) -> Tensor:
         """Orthogonal projection of x (N, 1, H, W) on zero mean over each free component."""
-        if self.labels.shape[1] == 0:
+        if self.share.shape[1] == 0:
             return x
         flat = x.flatten(1)
+        if self.labels.shape[1] == 0:
+            mean = torch.linalg.vecdot(flat, self.share)[:, None]
+            return torch.where(self.share > 0, flat - mean, 0).view_as(x)
         sums = torch.zeros_like(flat).scatter_add(1, self.labels, flat)
         return (flat - sums.gather(1, self.labels) * self.share).view_as(x)
 
@@ -67,16 +72,20 @@ def _roots(parent: Tensor) -> Tensor:
 
 def free_constants(w: Tensor, r: Tensor | None) -> Gauge:
     """The gauge of (*) with edge weights w (N, 2, H, W) and anchor weights r (N, 1, H, W) or None."""
+    nothing = torch.empty_like(w[:, 0, :0, 0])
     if r is not None and bool((r > 0).all()):  # as in every z-step of DLS on a full rectangle
-        return Gauge(torch.empty_like(w[:, 0, :0, 0], dtype=torch.int64), w[:, 0, :0, 0].clone())
+        return Gauge(nothing.long(), nothing)
     labels = connected_components(w > 0).flatten(1)
     ones = torch.ones_like(labels, dtype=w.dtype)
-    size = torch.zeros_like(ones).scatter_add(1, labels, ones)
-    share = 1 / size.gather(1, labels)
-    if r is not None:
-        held = torch.zeros_like(ones).scatter_add(1, labels, (r > 0).to(w.dtype).flatten(1))
-        share = torch.where(held.gather(1, labels) > 0, 0, share)
-    return Gauge(labels, share)
+    size = torch.zeros_like(ones).scatter_add(1, labels, ones).gather(1, labels)
+    if r is None or not bool(r.any()):
+        several = size > 1
+        first, last = torch.where(several, labels, labels.shape[1]).amin(1), torch.where(several, labels, 0).amax(1)
+        if bool((first >= last).all()):
+            return Gauge(nothing.long(), torch.where(several, 1 / size, 0))
+        return Gauge(labels, 1 / size)
+    held = torch.zeros_like(ones).scatter_add(1, labels, (r > 0).to(w.dtype).flatten(1))
+    return Gauge(labels, torch.where(held.gather(1, labels) > 0, 0, 1 / size))
 
 
 def remove_free_constants(z: Tensor, mask: Tensor | None = None, r: Tensor | None = None) -> Tensor:

@@ -6,6 +6,7 @@ import warnings
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchdls.operators import GradientOperator, as_pixel_size
@@ -15,6 +16,9 @@ from torchdls.solvers.direct import direct_map, solve_direct
 
 # From this ratio of anchor to edge weight on, the diagonal is the cheaper preconditioner (measured on a CPU).
 _FIRM = 0.25
+
+# Side of the blocks over which the preconditioner averages weights.
+_SMOOTH = 16
 
 
 class ConvergenceWarning(UserWarning):
@@ -249,41 +253,66 @@ def _warn(residual: Tensor, converged: Tensor, setting: _Setting) -> None:
 
 
 def _normal(w: Tensor, r: Tensor, setting: _Setting) -> LinearMap:
-    """z -> H z = A^T (w A z) + r z."""
-    a = _A(setting)
-    return lambda z: a.adjoint(w * a(z)) + r * z
+    """z -> H z = A^T (w A z) + r z, edge by edge: what flows along an edge leaves one end and enters the other."""
+    dx, dy = setting.pixel_size
+    across, down = (w[:, :1, :, :-1] / dx**2).contiguous(), w[:, 1:, :-1] / dy**2
+
+    def apply(z: Tensor) -> Tensor:
+        result = r * z
+        for weight, dim in ((across, -1), (down, -2)):
+            n = z.shape[dim] - 1
+            flow = (z.narrow(dim, 1, n) - z.narrow(dim, 0, n)).mul_(weight)
+            result.narrow(dim, 0, n).sub_(flow)
+            result.narrow(dim, 1, n).add_(flow)
+        return result
+
+    return apply
 
 
 def preconditioner(w: Tensor, r: Tensor, pixel_size: tuple[float, float]) -> LinearMap:
     r"""The map b -> S (A^T A + rho)^{-1} S b: a direct solve between two diagonal scalings.
 
-    With d the mean weight of a pixel's live edges and k = 2/dx^2 + 2/dy^2 the diagonal of A^T A, the scaling
-    s_i^2 = (k + rho) / (k d_i + r_i) matches the diagonals, and rho is the mean of the scaled anchor weights s_i^2 r_i:
-    rho = k q / (1 - q) with q = mean(r_i / (k d_i + r_i)). Equal weights give back the exact inverse; a few strong
-    control points count as a few pixels however strong they are. Dead pixels (no edge, no anchor) have s = 0.
+    With d the weight of the edges around a pixel (see `_local_weight`) and k = 2/dx^2 + 2/dy^2 the diagonal of A^T A,
+    the scaling s_i^2 = (k + rho) / (k d_i + r_i) matches the diagonals, and rho is the mean of the scaled anchor weights
+    s_i^2 r_i: rho = k q / (1 - q) with q = mean(r_i / (k d_i + r_i)). Equal weights give back the exact inverse; a few
+    strong control points count as a few pixels however strong they are. Dead pixels (no edge, no anchor) have s = 0.
+    All of it runs in single precision, at half the cost: it need only be close to the inverse.
 
     Where the anchors hold every surface firmly the diagonal alone does nearly as well, and costs a tenth.
     """
     k = sum(2 / d**2 for d in pixel_size)
-    d = edge_ends(w) / edge_ends((w > 0).to(w.dtype)).clamp(min=1)
-    total = k * d + r
+    total = k * _local_weight(w) + r
     alive = total > 0
     total = torch.where(alive, total, 1)
     n_alive = alive.sum((-3, -2, -1), keepdim=True).clamp(min=1)
     q = torch.where(alive, r / total, 0).sum((-2, -1), keepdim=True) / n_alive
-    rest = torch.where(alive, k * d / total, 0).sum((-2, -1), keepdim=True) / n_alive  # 1 - q without cancellation
+    rest = torch.where(alive, 1 - r / total, 0).sum((-2, -1), keepdim=True) / n_alive
     rho = k * q / rest.clamp(min=1e-6)
     if bool((rho > _FIRM * k).all()):
         scale = torch.tensor(pixel_size, dtype=w.dtype, device=w.device).view(1, 2, 1, 1)
         diagonal = edge_ends(w / scale.square()) + r
-        return lambda b: b / torch.where(alive, diagonal, 1)
-    s = torch.where(alive, ((k + rho) / total).sqrt(), 0)
-    inverse = direct_map((w.shape[-2], w.shape[-1]), rho, pixel_size, w)
-    return lambda b: s * inverse(s * b)
+        inverse = torch.where(alive, 1 / torch.where(alive, diagonal, 1), 0)
+        return lambda b: b * inverse
+    s = torch.where(alive, ((k + rho) / total).sqrt(), 0).float()
+    direct = direct_map((w.shape[-2], w.shape[-1]), rho.float(), pixel_size, s)
+    return lambda b: direct(s * b.float()).mul_(s).to(b.dtype)
+
+
+def _local_weight(w: Tensor) -> Tensor:
+    """(N, 1, H, W): geometric mean of the weights of the live edges within some pixels; 0 where a pixel has none.
+
+    Weights that vary from pixel to pixel at random act together as one weight, this mean, while slow changes are felt
+    where they are. (Followed pixel by pixel, random weights from .1 to 1 took 490 steps at 256^2; so they take 16.)
+    """
+    (h, width), c = w.shape[-2:], _SMOOTH
+    live, logs = edge_ends((w > 0).to(w.dtype)), edge_ends(torch.where(w > 0, w, 1).log())
+    count, total = (F.avg_pool2d(F.pad(t, (0, -width % c, 0, -h % c)), c) for t in (live, logs))
+    blocks = torch.cat([(count > 0).to(w.dtype), total / torch.where(count > 0, count, 1)], 1)
+    seen, mean = F.interpolate(blocks, scale_factor=float(c), mode="bilinear")[..., :h, :width].split(1, 1)
+    return torch.where(live > 0, (mean / torch.where(live > 0, seen, 1)).exp(), 0)
 
 
 def edge_ends(w: Tensor) -> Tensor:
     """(N, 1, H, W): sum of an edge field over the (up to four) edges at each pixel."""
     x, y = w.split(1, -3)
-    pad = torch.nn.functional.pad
-    return x + y + pad(x[..., :, :-1], (1, 0)) + pad(y[..., :-1, :], (0, 0, 1, 0))
+    return x + y + F.pad(x[..., :, :-1], (1, 0)) + F.pad(y[..., :-1, :], (0, 0, 1, 0))
