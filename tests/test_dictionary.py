@@ -46,6 +46,23 @@ def test_sweep_is_the_papers(order, bound, unused, K):
         assert (B[:, -1] == 0).all(), "the case of an unused atom occurs"
 
 
+@pytest.mark.parametrize("dtype, atol", [(torch.float32, 1e-4), (torch.float64, 1e-9)], ids=str)
+@pytest.mark.parametrize("order", ["atom", "block"])
+def test_sparse_batches_are_the_papers(order, dtype, atol):
+    """Few patches use an atom, and on the second surface none does: then only those that do are looked at."""
+    P, D, B = problem(N=3, L=300)
+    P[1] *= 0.01
+    B[1] = 0
+    mu = np.full(9, 2.2)
+    D_new, B_new = soup_dil_sweep(P.to(dtype), D.to(dtype), B.to(dtype), 2.2, order=order)
+    assert 0.01 < float((B_new != 0).double().mean()) < 0.2
+    assert (B_new[1] == 0).all()
+    for i in range(3):
+        expected = soup_dil(P[i].numpy(), D[i].numpy(), B[i].numpy(), mu, order=order)
+        np.testing.assert_allclose(D_new[i].numpy(), expected[0], atol=atol)
+        np.testing.assert_allclose(B_new[i].numpy(), expected[1], atol=10 * atol)
+
+
 @pytest.mark.parametrize("order", ["atom", "block"])
 def test_fixed_dictionary_updates_the_codes_alone(order):
     P, D, B = problem()

@@ -8,6 +8,7 @@ from functools import reduce
 from typing import Literal, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchdls._tape import recorded
@@ -210,28 +211,48 @@ def _atom_order(R: Tensor, D: Tensor, B: Tensor, rule: _Rule) -> tuple[Tensor, T
     for start in range(0, D.shape[-1], _GROUP):
         D0, B0 = D[..., start : start + _GROUP], B[:, start : start + _GROUP]
         rest = torch.baddbmm(B0, D0.mT.expand(R.shape[0], -1, -1), R)
-        # What the group has changed so far: R - C S is the residual of the moment, with C (N, n, 2k) and S (N, 2k, L).
-        C, S = D0[..., :0], B0[:, :0]
+        C, codes = D0[..., :0], B0[:, :0]  # the new atoms and codes of the group
+        room = torch.empty_like(B0) if rule.in_place else None
         for k in range(D0.shape[-1]):
-            d, b = D0[..., k : k + 1], B0[:, k : k + 1]
             row = rule.shrink(rest[:, :1], start + k)
-            h = _times_sparse(R, row, rule.in_place) - C @ (S @ row.mT) + d * (b @ row.mT)
+            # R - C codes + (what stood there before) is the residual of the moment without atom k.
+            old = D0[..., : k + 1] @ (B0[:, : k + 1] @ row.mT)
+            h = _times_sparse(R, row, rule.in_place) - C @ (codes @ row.mT) + old
+            d = D0[..., k : k + 1]
             atom = _where_used(rule.unit(h.sum(0, keepdim=True) if shared else h), d, rule.unused)
-            pair, change = torch.cat([atom, -d], -1), torch.cat([row, b], 1)
+            pair, change = torch.cat([atom, -d], -1), torch.cat([row, B0[:, k : k + 1]], 1)
             rest = rule.add_product(rest[:, 1:], D0[..., k + 1 :].mT @ pair, change, -1)
-            C, S = torch.cat([C, pair], -1), torch.cat([S, change], 1)
-            atoms.append(atom)
-        R = rule.add_product(R, C, S, -1)
-        groups.append(B0.copy_(S[:, ::2]) if rule.in_place else S[:, ::2])
+            C, codes = torch.cat([C, atom], -1), _append(codes, row, room)
+        R = rule.add_product(R, torch.cat([C, -D0], -1), torch.cat([codes, B0], 1), -1)
+        atoms.append(C)
+        groups.append(B0.copy_(codes) if rule.in_place else codes)
     return R, torch.cat(atoms, -1), rule.join(groups, 1, B)
 
 
+def _append(rows: Tensor, row: Tensor, room: Tensor | None) -> Tensor:
+    """The rows and one more, in the room that was reserved for them or, where that is None, in new memory."""
+    if room is None:
+        return torch.cat([rows, row], 1)
+    count = rows.shape[1]
+    room[:, count : count + 1] = row
+    return room[:, : count + 1]
+
+
 def _times_sparse(R: Tensor, b: Tensor, look: bool) -> Tensor:
-    """R b^T, from the patches with a nonzero code alone where one surface makes that worth the search."""
-    if not look or R.shape[0] > 1:
-        return R @ b.mT
-    used = b[0, 0].nonzero()[:, 0]
-    return (R[0].mT.index_select(0, used).mT @ b[0, 0].index_select(0, used))[None, :, None]
+    """R b^T (N, n, 1), from the patches with a nonzero code alone where that is worth the search."""
+    patches = R.mT  # (N, L, n)
+    if look and len(R) == 1:
+        used = b[0, 0].nonzero()[:, 0]
+        return (patches[0].index_select(0, used).mT @ b[0, 0].index_select(0, used))[None, :, None]
+    if look and patches.is_contiguous():
+        code = b.flatten()
+        used = code.nonzero()[:, 0]
+        if 4 * len(used) < len(code):
+            first = torch.searchsorted(used, torch.arange(0, len(code), b.shape[-1], device=b.device))
+            weight = code.index_select(0, used)
+            sums = F.embedding_bag(used, patches.flatten(0, 1), first, mode="sum", per_sample_weights=weight)
+            return sums[..., None]
+    return (b @ patches).mT
 
 
 def _normalize(h: Tensor) -> Tensor:

@@ -273,9 +273,10 @@ def preconditioner(w: Tensor, r: Tensor, pixel_size: tuple[float, float]) -> Lin
     r"""The map b -> S (A^T A + rho)^{-1} S b: a direct solve between two diagonal scalings.
 
     With d the weight of the edges around a pixel (see `_local_weight`) and k = 2/dx^2 + 2/dy^2 the diagonal of A^T A,
-    the scaling s_i^2 = (k + rho) / (k d_i + r_i) matches the diagonals, and rho is the mean of the scaled anchor weights
-    s_i^2 r_i: rho = k q / (1 - q) with q = mean(r_i / (k d_i + r_i)). Equal weights give back the exact inverse; a few
-    strong control points count as a few pixels however strong they are. Dead pixels (no edge, no anchor) have s = 0.
+    the scaling s_i^2 = (k + rho) / (k d_i + r_i) matches the diagonals, and rho is the mean of the scaled anchor
+    weights s_i^2 r_i: rho = k q / (1 - q) with q = mean(r_i / (k d_i + r_i)). Equal weights give back the exact
+    inverse; a few strong control points count as a few pixels however strong they are. Dead pixels (no edge, no
+    anchor) have s = 0.
     All of it runs in single precision, at half the cost: it need only be close to the inverse.
 
     Where the anchors hold every surface firmly the diagonal alone does nearly as well, and costs a tenth.
