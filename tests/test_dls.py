@@ -283,3 +283,22 @@ def test_a_batch_is_its_surfaces_one_by_one(learn):
         alone = dls.solve(g[i : i + 1])
         torch.testing.assert_close(together.height[i : i + 1], alone.height, rtol=0, atol=1e-8)
         torch.testing.assert_close(together.codes[i : i + 1], alone.codes, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("given", [{}, {"anchor": 0.5}], ids=["free", "anchored"])
+def test_patches_side_by_side_need_no_iterative_solve(given, monkeypatch):
+    """Every pixel is then in one patch, and the height is one direct solve: the one that iterations find, too."""
+    g = random_field(2, 2, 24, 16)
+    fields = {}
+    if given:
+        fields = {"anchor": random_field(2, 1, 24, 16, seed=1), "anchor_weight": given["anchor"]}
+    dls = DLS(patch_size=4, stride=4, n_atoms=16, lam=0.05, mu=0.3, n_iter=3, tol=0.0, z_tol=1e-12)
+    assert not Patches(4, 4).tile((24, 15))
+    with monkeypatch.context() as patch:
+        patch.setattr(Patches, "tile", lambda *_: False)
+        expected = dls.solve(g, **fields)
+    with monkeypatch.context() as patch:
+        patch.setattr("torchdls.solvers.poisson.conjugate_gradients", None)
+        found = dls.solve(g, **fields)
+    torch.testing.assert_close(found.height, expected.height, rtol=0, atol=1e-8)
+    torch.testing.assert_close(found.objective, expected.objective)

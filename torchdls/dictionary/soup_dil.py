@@ -212,7 +212,7 @@ def _atom_order(R: Tensor, D: Tensor, B: Tensor, rule: _Rule) -> tuple[Tensor, T
         D0, B0 = D[..., start : start + _GROUP], B[:, start : start + _GROUP]
         rest = torch.baddbmm(B0, D0.mT.expand(R.shape[0], -1, -1), R)
         C, codes = D0[..., :0], B0[:, :0]  # the new atoms and codes of the group
-        room = torch.empty_like(B0) if rule.in_place else None
+        room = B0.new_empty(B.shape[0], 2 * B0.shape[1], B.shape[2]) if rule.in_place else None
         for k in range(D0.shape[-1]):
             row = rule.shrink(rest[:, :1], start + k)
             # R - C codes + (what stood there before) is the residual of the moment without atom k.
@@ -223,36 +223,33 @@ def _atom_order(R: Tensor, D: Tensor, B: Tensor, rule: _Rule) -> tuple[Tensor, T
             pair, change = torch.cat([atom, -d], -1), torch.cat([row, B0[:, k : k + 1]], 1)
             rest = rule.add_product(rest[:, 1:], D0[..., k + 1 :].mT @ pair, change, -1)
             C, codes = torch.cat([C, atom], -1), _append(codes, row, room)
-        R = rule.add_product(R, torch.cat([C, -D0], -1), torch.cat([codes, B0], 1), -1)
+        R = rule.add_product(R, torch.cat([C, -D0], -1), _append(codes, B0, room), -1)
         atoms.append(C)
         groups.append(B0.copy_(codes) if rule.in_place else codes)
     return R, torch.cat(atoms, -1), rule.join(groups, 1, B)
 
 
-def _append(rows: Tensor, row: Tensor, room: Tensor | None) -> Tensor:
-    """The rows and one more, in the room that was reserved for them or, where that is None, in new memory."""
+def _append(rows: Tensor, more: Tensor, room: Tensor | None) -> Tensor:
+    """The rows and more of them, in the room that was reserved or, where that is None, in new memory."""
     if room is None:
-        return torch.cat([rows, row], 1)
-    count = rows.shape[1]
-    room[:, count : count + 1] = row
-    return room[:, : count + 1]
+        return torch.cat([rows, more], 1)
+    end = rows.shape[1] + more.shape[1]
+    room[:, rows.shape[1] : end] = more
+    return room[:, :end]
 
 
 def _times_sparse(R: Tensor, b: Tensor, look: bool) -> Tensor:
     """R b^T (N, n, 1), from the patches with a nonzero code alone where that is worth the search."""
     patches = R.mT  # (N, L, n)
-    if look and len(R) == 1:
-        used = b[0, 0].nonzero()[:, 0]
-        return (patches[0].index_select(0, used).mT @ b[0, 0].index_select(0, used))[None, :, None]
-    if look and patches.is_contiguous():
-        code = b.flatten()
-        used = code.nonzero()[:, 0]
-        if 4 * len(used) < len(code):
-            first = torch.searchsorted(used, torch.arange(0, len(code), b.shape[-1], device=b.device))
-            weight = code.index_select(0, used)
-            sums = F.embedding_bag(used, patches.flatten(0, 1), first, mode="sum", per_sample_weights=weight)
-            return sums[..., None]
-    return (b @ patches).mT
+    code = b.flatten()
+    used = code.nonzero()[:, 0] if look and patches.is_contiguous() else None
+    if used is None or 4 * len(used) > len(code):
+        return (b @ patches).mT
+    patches, weight = patches.flatten(0, 1), code.index_select(0, used)
+    if len(R) == 1:
+        return (weight @ patches.index_select(0, used))[None, :, None]
+    first = torch.searchsorted(used, torch.arange(0, len(code), b.shape[-1], device=b.device))
+    return F.embedding_bag(used, patches, first, mode="sum", per_sample_weights=weight)[..., None]
 
 
 def _normalize(h: Tensor) -> Tensor:

@@ -20,6 +20,9 @@ import torch
 from torch import Tensor
 
 Threshold = Literal["hard", "soft", "firm"]
+# Codes that are counted at once: PyTorch takes nine bytes of memory for each.
+_AT_ONCE = 2**20
+
 THRESHOLDS: tuple[Threshold, ...] = ("hard", "soft", "firm")
 
 
@@ -60,6 +63,7 @@ def penalty(b: Tensor, mu: Tensor, rule: Threshold = "hard") -> Tensor:
 def total_penalty(B: Tensor, mu: Tensor, rule: Threshold = "hard") -> Tensor:
     """(N,) the penalties of all codes (N, K, L) of each surface, with one mu (N,) for each."""
     if rule == "hard":
-        count = B.count_nonzero((1, 2))
+        rows = max(1, _AT_ONCE // max(1, B.shape[0] * B.shape[2]))
+        count = torch.stack([part.count_nonzero((1, 2)) for part in B.split(rows, 1)]).sum(0)
         return torch.where(count > 0, mu.square() * count, 0)
     return penalty(B, mu[:, None, None], rule).sum((1, 2))

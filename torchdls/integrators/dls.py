@@ -305,6 +305,8 @@ class DLS(Iterative[DLSResult]):
         coverage = self.patches.coverage(shape, dtype=gradient.dtype, device=gradient.device)
         edges = self.data_term.edges(fields) if self._steady else None
         if mask is None:
+            if self.patches.tile(shape):  # one number, with which the height is one direct solve
+                coverage = coverage[..., :1, :1]
             return Model(fields, self.patches, coverage, None, edges, noise, lam, mu)
         valid = self.patches.extract(mask.to(gradient.dtype)) > 0
         return Model(fields, self.patches, coverage * mask, valid.expand(N, -1, -1), edges, noise, lam, mu)

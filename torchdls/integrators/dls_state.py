@@ -11,6 +11,9 @@ from torchdls.dictionary.thresholds import Threshold, penalty, total_penalty
 from torchdls.integrators.base import Fields
 from torchdls.operators import Patches
 
+# Numbers that are squared at once for their sum: a norm would need no memory, but in float32 it is off by 1e-4.
+_AT_ONCE = 2**20
+
 
 class Model(NamedTuple):
     """The constants of one run.
@@ -86,7 +89,9 @@ def patch_cost(R: Tensor, B: Tensor, mu: Tensor, valid: Tensor | None, rule: Thr
     """(N,) fit and penalty of the patches; only the valid pixels of a patch count."""
     R = R if valid is None else torch.where(valid, R, 0)
     flat = R.mT.flatten(1)  # as it lies in memory
-    return torch.linalg.vecdot(flat, flat) + total_penalty(B, mu, rule)
+    parts = flat.split(max(1, _AT_ONCE // max(1, len(flat))), 1)
+    fit = torch.stack([torch.linalg.vecdot(part, part) for part in parts]).sum(0)
+    return fit + total_penalty(B, mu, rule)
 
 
 def worthwhile(bare: Tensor, R: Tensor, B: Tensor, mu: Tensor, rule: Threshold) -> tuple[Tensor, Tensor]:

@@ -66,6 +66,10 @@ class Patches:
         rows, columns = ((m - p + s - 1) // s + 1 for m, p, s in zip((h, w), self._size, self._stride, strict=True))
         return rows, columns
 
+    def tile(self, shape: Sequence[int]) -> bool:
+        """Whether the patches of an image of shape (.., H, W) lie side by side: every pixel is in one of them."""
+        return self.stride == self.size and all(m % p == 0 for m, p in zip(shape[-2:], self._size, strict=True))
+
     def touching(self, axis: int, length: int, low: int, high: int) -> tuple[slice, slice]:
         """Pixels and numbers of the patches that hold a pixel from `low` to `high`, along an axis of `length` pixels.
 
