@@ -148,16 +148,3 @@ def test_modes_that_do_not_exist_are_refused(options: dict[str, Any], message: s
 def test_automatic_mode() -> None:
     assert DLS(learn="fixed").grad == "implicit"
     assert DLS().grad == DLS(learn="fixed", threshold="firm").grad == "unroll"
-
-
-@pytest.mark.parametrize(
-    "options", [{}, {"learn": "shared", "order": "block"}, {"learn": "fixed", "threshold": "soft"}]
-)
-def test_checkpoint_changes_memory_alone(options: dict[str, Any]) -> None:
-    g, mask = random_field(2, 2, H, W), MASK.expand(2, -1, -1, -1)
-    slopes = []
-    for checkpoint in (False, True):
-        point = g.clone().requires_grad_()
-        model = converged("unroll", **{"learn": "each", "n_iter": 4, "tol": 1e-3, **options}, checkpoint=checkpoint)
-        slopes.append(torch.autograd.grad((model(point, mask).square()).sum(), point)[0])
-    torch.testing.assert_close(*slopes, rtol=1e-9, atol=1e-9)

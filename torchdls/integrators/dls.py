@@ -16,7 +16,7 @@ from torchdls.dictionary.learners import FixedDictionary, Learner
 from torchdls.dictionary.soup_dil import Order, Unused
 from torchdls.dictionary.thresholds import Threshold
 from torchdls.integrators.base import Fields, Integrator, edge_cost
-from torchdls.integrators.dls_checkpoint import checkpointed
+from torchdls.integrators.dls_checkpoint import Iteration, run_in_legs
 from torchdls.integrators.dls_checks import check_dictionary, check_size, parameter, per_surface
 from torchdls.integrators.dls_implicit import at_fixed_point
 from torchdls.integrators.dls_options import Grad, Learn, check_options, choose_learner, derivative, keep
@@ -83,14 +83,12 @@ class DLS(Iterative[DLSResult]):
         n_atoms: K, the number of atoms of the initial DCT dictionary; ignored if `dictionary` is given.
         lam: weight of the patch model; a number, a tensor (a number or one per surface), or "auto" (0.5).
         mu: threshold on the codes; a number, a tensor (a number or one per surface), or "auto": the noise
-        level
-            of one gradient sample, which `noise_level` estimates from the non-integrable part of each field.
+            level of one gradient sample, which `noise_level` estimates from the non-integrable part of each field.
         n_iter: limit of iterations.
         data_term: an integrator built on the solve (*), which provides the data term and the first height.
         dictionary: initial dictionary (n, K), or (N, n, K) for each surface of a batch; atoms are brought to unit
-        norm. An
-            `nn.Parameter` is trained with the module, a tensor is a buffer. None for `dct_dictionary(patch_size,
-            n_atoms)`.
+            norm. An `nn.Parameter` is trained with the module, a tensor is a buffer. None for
+            `dct_dictionary(patch_size, n_atoms)`.
         z_step: "exact" solves for the height; "proximal" takes `n_prox` proximal gradient steps as in the paper, with
             tau = 1 / ||A||^2 (1/8 for unit weights and square pixels).
         order: order of the sweep, "atom" (the paper's) or "block".
@@ -115,8 +113,8 @@ class DLS(Iterative[DLSResult]):
             "frozen_dictionary": the same as if the learned dictionary did not move, an approximation. "none". "auto" is
             "implicit" where that is exact and "unroll" elsewhere.
         grad_tol: relative residual of the linear solve of an implicit derivative.
-        checkpoint: save memory of an unrolled derivative: only heights, dictionaries and nonzero codes are kept, and
-            each iteration is run again in the backward pass.
+        checkpoint: save memory of an unrolled derivative: only heights, dictionaries and nonzero codes are kept, of
+            one iteration in sqrt(n_iter), and iterations are run again in the backward pass. First derivatives only.
         pixel_size: (dx, dy) or one number; heights come out in its unit.
 
     Raises:
@@ -226,14 +224,17 @@ class DLS(Iterative[DLSResult]):
     def _run_within(self, model: Model, callback: Callback | None) -> DLSResult:
         state = self._start(model)
         objective = [self._objective(model, state)]
+        if self.checkpoint and self.n_iter and taped(state.z, state.D, model.lam, model.mu):
+            options = self.learner, self.learn != "fixed", self.n_sweeps, self.bound, self.threshold, self.tol
+            parts_of_one = Iteration(self._round, self._settled, self._step, *options)
+            end, values, active = run_in_legs(parts_of_one, model, state, objective[0], self.n_iter, callback)
+            return DLSResult(end.z, end.D, end.B, values, model.noise, model.lam, model.mu, ~active)
         active = torch.ones_like(model.noise, dtype=torch.bool)
         running, parts = model, [Part(torch.arange(len(active), device=active.device), state)]
         look = self.tol > 0 and visible(model.fields.gradient)
         for iteration in range(1, self.n_iter + 1):
             index, old = parts[-1]
-            run = functools.partial(self._round, first=iteration == 1)
-            again = self.checkpoint and taped(old.z, old.D, running.lam, running.mu)
-            new, value = checkpointed(run, running, old) if again else run(running, old)
+            new, value = self._round(running, old, first=iteration == 1)
             settled = self._settled(new, old)
             if not look:  # every surface stays in the batch, and those that have settled do not move
                 new = old.choose(active, new) if self.tol > 0 else new
@@ -287,7 +288,7 @@ class DLS(Iterative[DLSResult]):
             if bare is not None:
                 R, B = worthwhile(bare, R, B, model.mu, self.threshold)
                 bare = None
-        z = self._step(model, state.z, R)
+        z = self._step(model, state.z, model.patches.adjoint(R, state.z.shape))
         return State(state.start, z, model.patches.extract_onto(R, z - state.z), D, B)
 
     def _settled(self, new: State, old: State) -> Tensor:
@@ -339,13 +340,13 @@ class DLS(Iterative[DLSResult]):
         D = D / D.norm(dim=1, keepdim=True)
         return D.expand(N, -1, -1) if self.learn == "each" else D
 
-    def _step(self, model: Model, z: Tensor, R: Tensor) -> Tensor:
-        """The height for given patches D B = P - R."""
+    def _step(self, model: Model, z: Tensor, folded: Tensor) -> Tensor:
+        """The height for given patches D B = P - R, with R folded."""
         fields = model.fields
         v, w = model.edges or self.data_term.edges(fields, z)
         strength = 2 * model.lam[:, None, None, None]
         weight = strength * model.coverage
-        pull = weight * z - strength * model.patches.adjoint(R, z.shape)  # = 2 lam fold(D B), as fold(P) = coverage z
+        pull = weight * z - strength * folded  # = 2 lam fold(D B), as fold(P) = coverage z
         if fields.anchor is not None and fields.anchor_weight is not None:
             weight, pull = weight + fields.anchor_weight, pull + fields.anchor_weight * fields.anchor
         if self.z_step == "exact":

@@ -99,9 +99,14 @@ def worthwhile(bare: Tensor, R: Tensor, B: Tensor, mu: Tensor, rule: Threshold) 
 
     That sweep also fits the heights continued beyond the mask, which the objective does not count.
     """
-    cost = R.square().sum(1, keepdim=True) + penalty(B, mu[:, None, None], rule).sum(1, keepdim=True)
-    pays = cost <= bare.square().sum(1, keepdim=True)
+    pays = pays_off(bare, R, B, mu, rule)
     return torch.where(pays, R, bare), torch.where(pays, B, 0)
+
+
+def pays_off(bare: Tensor, R: Tensor, B: Tensor, mu: Tensor, rule: Threshold) -> Tensor:
+    """(N, 1, L) bool: the patches that cost less, or as much, with their codes as without."""
+    cost = R.square().sum(1, keepdim=True) + penalty(B, mu[:, None, None], rule).sum(1, keepdim=True)
+    return cost <= bare.square().sum(1, keepdim=True)
 
 
 def support(free: Tensor) -> tuple[Tensor, Tensor]:
