@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
 from typing import Any
 
 import numpy as np
@@ -68,3 +70,28 @@ def sparse_cg(p: np.ndarray, q: np.ndarray, mask: np.ndarray) -> np.ndarray:
 def amg_cg(pyamg: Any, p: np.ndarray, q: np.ndarray, mask: np.ndarray) -> np.ndarray:
     H, b = masked_system(p, q, mask)
     return pyamg.ruge_stuben_solver(H).solve(b, tol=1e-8, accel="cg")
+
+
+def grad2surf(module: Any, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Global least squares; the package writes to the slopes it is given."""
+    h, w = p.shape
+    return np.asarray(module.g2s(np.arange(float(w)), np.arange(float(h)), p.copy(), q.copy()))
+
+
+def dbini(module: Any, normals: Any, mask: Any) -> Any:
+    """Masked least squares: one step of bilateral integration, with k = 0 for no bilateral weights."""
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        return module.bilateral_normal_integration(normals, mask, k=0, max_iter=1, cg_rtol=1e-6)
+
+
+def spams_dictionary(spams: Any, X: np.ndarray, D: np.ndarray, passes: float, threads: int) -> np.ndarray:
+    """Online learning from the dictionary D over all columns of X, so many times, five nonzeros each."""
+    batches = max(1, round(passes * X.shape[1] / 512))
+    settings = {"K": D.shape[1], "lambda1": 5, "mode": 3, "batchsize": 512, "numThreads": threads}
+    return spams.trainDL(X, D=D, iter=batches, verbose=False, **settings)
+
+
+def spams_error(spams: Any, X: np.ndarray, D: np.ndarray) -> float:
+    """||X - D B||^2 / ||X||^2 with five nonzeros per column by orthogonal matching pursuit."""
+    B = spams.omp(X, np.asfortranarray(D), L=5, eps=0.0, numThreads=-1)
+    return float(np.square(X - D @ B.toarray()).sum() / np.square(X).sum())

@@ -1,8 +1,8 @@
-"""torchdls beside what a user would take instead: `python benchmarks/compare.py` (about two minutes; add --smoke).
+"""torchdls beside what a user would take instead: `python benchmarks/compare.py` (some minutes; add --smoke).
 
 In every case the candidates take turns in one process (A B A B ..); the ratio of the medians is what travels to other
 machines. Floors (a product with the dictionary, an FFT and its inverse, a copy) stand beside them, and each candidate's
-peak memory is that of a process of its own. Writes JSON and Markdown.
+peak memory is that of a process of its own. Writes JSON and Markdown, and the table of the README.
 """
 
 from __future__ import annotations
@@ -18,11 +18,30 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from _peers import ScipyPoisson, amg_cg, optional, sparse_cg, sparse_direct
-from _report import markdown_table, results_folder, write_json
+from _peers import (
+    ScipyPoisson,
+    amg_cg,
+    dbini,
+    grad2surf,
+    optional,
+    spams_dictionary,
+    spams_error,
+    sparse_cg,
+    sparse_direct,
+)
+from _report import markdown_table, replace_section, results_folder, write_json
 from _timing import fresh_process, interleaved, peak_megabytes, statistics
 
-from torchdls import DLS, LeastSquares, Patches, add_noise, dct_dictionary, soup_dil_sweep
+from torchdls import (
+    DLS,
+    HarkerOLeary,
+    LeastSquares,
+    Patches,
+    add_noise,
+    dct_dictionary,
+    gradient_to_normals,
+    soup_dil_sweep,
+)
 from torchdls.dictionary.soup_dil import Order, residual_sweep
 from torchdls.surfaces import SURFACES
 
@@ -87,6 +106,27 @@ def masked(size: int, radius: float) -> Case:
     return Case(f"disk of {inside.sum()} pixels to 1e-8", "torchdls", against, 1 / 3, candidates)
 
 
+def masked_normals(size: int) -> Case:
+    g = noisy(size, torch.float64)
+    y, x = np.mgrid[:size, :size] - (size - 1) / 2
+    mask = torch.from_numpy(x**2 + y**2 < (0.47 * size) ** 2)
+    ours, normals = LeastSquares(tol=1e-6), gradient_to_normals(g)[0].float()
+    candidates: dict[str, Run] = {"torchdls": lambda: ours(g, mask[None, None])}
+    if module := optional("dbini_torch"):
+        candidates["dbini-torch, one step"] = partial(dbini, module, normals, mask)
+    name = f"masked least squares {size}^2 to 1e-6"
+    return Case(name, "torchdls", list(candidates)[-1], 1.0, candidates)
+
+
+def harker_oleary(size: int) -> Case:
+    g, ours = noisy(size, torch.float64), HarkerOLeary()
+    p, q = g[0].numpy()
+    candidates: dict[str, Run] = {"torchdls": lambda: ours(g)}
+    if module := optional("pyGrad2Surf.g2s"):
+        candidates["pyGrad2Surf"] = partial(grad2surf, module, p, q)
+    return Case(f"HarkerOLeary {size}^2 float64", "torchdls", list(candidates)[-1], 0.1, candidates)
+
+
 def sweep(size: int, order: Order, target: float) -> Case:
     """One sweep in the middle of DLS, where codes are sparse, as DLS runs it: from the residual, in place."""
     result = DLS(order=order, n_iter=4, tol=0.0).solve(noisy(size, torch.float32))
@@ -141,18 +181,42 @@ def dictionary_pass(size: int) -> Case:
     """One pass over the patches from the cosine dictionary, with about five nonzeros per patch."""
     P, D0, B0, mu = patches_for_learning(size)
     candidates: dict[str, Run] = {"sweep": lambda: soup_dil_sweep(P, D0, B0, mu, order="block")}
-    X = np.asfortranarray(P[0].numpy())
+    X, D = (np.asfortranarray(t[0].numpy()) for t in (P, D0))
     if spams := optional("spams"):
-        D = np.asfortranarray(D0[0].numpy())
-        settings = {"D": D, "K": 64, "lambda1": 5, "mode": 3, "batchsize": 512, "iter": -1, "numThreads": -1}
-        settings["iter"] = X.shape[1] // 512
-        candidates["SPAMS online pass"] = lambda: spams.trainDL(X, verbose=False, **settings)
+        candidates["SPAMS online pass"] = partial(spams_dictionary, spams, X, D, 1, torch.get_num_threads())
+    few = np.ascontiguousarray(X.T[:: max(1, X.shape[1] // 4000)])
     if learn := optional("sklearn.decomposition"):
-        coder = learn.SparseCoder(D0[0].numpy().T, transform_algorithm="omp", transform_n_nonzero_coefs=5)
-        few = np.ascontiguousarray(X.T[:: max(1, X.shape[1] // 4000)])
-        candidates["scikit-learn OMP, 4000 patches"] = lambda: coder.transform(few)
+        coder = learn.SparseCoder(D.T, transform_algorithm="omp", transform_n_nonzero_coefs=5)
+        candidates[f"scikit-learn OMP, {len(few)} patches"] = lambda: coder.transform(few)
+    if learn := optional("dictlearn"):
+        few, start = few.astype(float), D.T.astype(float)
+        ksvd = learn.DictionaryLearning(64, n_nonzero_coefs=5, max_iter=1, dict_init=start, random_state=0)
+        candidates[f"dictlearn K-SVD, {len(few)} patches"] = lambda: ksvd.fit(few)
     against = "SPAMS online pass" if spams else "sweep"
     return Case(f"dictionary pass, {X.shape[1]} patches", "sweep", against, 1.0, candidates)
+
+
+def error_curve(size: int, passes: tuple[int, ...]) -> list[tuple[Any, ...]]:
+    """Passes over the patches, then seconds and error of torchdls and of SPAMS, coded alike; none without SPAMS."""
+    spams = optional("spams")
+    if spams is None:
+        return []
+    P, D0, B0, mu = patches_for_learning(size)
+    X, start = (np.asfortranarray(t[0].numpy()) for t in (P, D0))
+    rows: list[tuple[Any, ...]] = [(0, 0.0, (error := spams_error(spams, X, start)), 0.0, error)]
+    for n in passes:
+
+        def sweeps(n: int = n) -> np.ndarray:
+            D, B = D0, B0
+            for _ in range(n):
+                D, B = soup_dil_sweep(P, D, B, mu, order="block")
+            return D[0].numpy()
+
+        runs = {"sweep": sweeps, "SPAMS": partial(spams_dictionary, spams, X, start, n, torch.get_num_threads())}
+        seconds = {name: median(t) for name, t in interleaved(runs, 0.0).items()}
+        errors = {name: spams_error(spams, X, run()) for name, run in runs.items()}
+        rows.append((n, seconds["sweep"], errors["sweep"], seconds["SPAMS"], errors["SPAMS"]))
+    return rows
 
 
 def patches_for_learning(size: int) -> tuple[torch.Tensor, ...]:
@@ -170,6 +234,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "ls1024f": partial(least_squares, 1024, torch.float32, 0.6),
     "batch": partial(batch, 64, 128),
     "masked": partial(masked, 256, 119.7),
+    "normals": partial(masked_normals, 128),
+    "harker": partial(harker_oleary, 512),
     "block": partial(sweep, 512, "block", 6),
     "atom": partial(sweep, 512, "atom", 10),
     "iteration": partial(iteration, 512, "block", 12),
@@ -180,10 +246,16 @@ CASES: dict[str, Callable[[], Case]] = {
 SMOKE: dict[str, Callable[[], Case]] = {
     "ls": partial(least_squares, 96, torch.float64, 1.0),
     "masked": partial(masked, 48, 20),
+    "normals": partial(masked_normals, 32),
+    "harker": partial(harker_oleary, 24),
     "block": partial(sweep, 48, "block", 6),
     "iteration": partial(iteration, 48, "block", 12),
     "small": partial(many_small, 3, 16),
+    "dictionary": partial(dictionary_pass, 40),
 }
+
+
+CURVE = "Error ||P - D B||^2 / ||P||^2 with five nonzeros per patch, after so many passes over the patches:"
 
 
 def rows(results: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
@@ -194,7 +266,24 @@ def rows(results: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
             against = result["against"] if ours else ""
             spread = f"{s['q1_ms']:.1f} .. {s['q3_ms']:.1f}"
             memory = f"{s['peak_mb']:.0f}" if "peak_mb" in s else ""
-            yield result["name"], name, s["median_ms"], spread, memory, verdict, against
+            yield result["name"], name, f"{s['median_ms']:.2f}", spread, memory, verdict, against
+
+
+def summary(results: dict[str, Any]) -> str:
+    """The table of the README: ours beside what it is held against."""
+    header = ("task", "torchdls, ms", "beside it", "ms", "ratio", "target")
+    lines = []
+    for r in results.values():
+        ours, other = (r["candidates"][r[k]]["median_ms"] for k in ("ours", "against"))
+        lines.append(
+            (r["name"], f"{ours:.3g}", r["against"], f"{other:.3g}", f"{r['ratio']:.2f}", f"{r['target']:.2f}")
+        )
+    return markdown_table(header, lines)
+
+
+def curve_table(curve: list[tuple[Any, ...]]) -> str:
+    header = ("passes", "torchdls, s", "error", "SPAMS, s", "error")
+    return markdown_table(header, [(n, f"{a:.2f}", f"{e:.5f}", f"{b:.2f}", f"{f:.5f}") for n, a, e, b, f in curve])
 
 
 def measure(key: str, case: Case, seconds: float, memory: bool) -> dict[str, Any]:
@@ -230,11 +319,18 @@ def main() -> None:
         seconds = 0.1 if args.smoke else args.seconds
         memory = not (args.smoke or args.no_memory)
         results = {key: measure(key, build(), seconds, memory) for key, build in chosen.items()}
+        whole = not args.only
+        curve = error_curve(40 if args.smoke else 512, (1,) if args.smoke else (1, 2, 4, 8)) if whole else []
     folder: Path = results_folder(args.smoke)
-    write_json(folder / "compare.json", threads=args.threads, results=results)
+    write_json(folder / "compare.json", threads=args.threads, results=results, error_against_time=curve)
     header = ("task", "candidate", "median ms", "quartiles ms", "peak MB", "ratio", "against")
-    (folder / "compare.md").write_text(markdown_table(header, rows(results)))
+    text = summary(results) + (f"\n{CURVE}\n\n{curve_table(curve)}" if curve else "")
+    (folder / "compare.md").write_text(f"{text}\n{markdown_table(header, rows(results))}")
+    print(text)
     print(f"wrote {folder / 'compare.md'}")
+    if whole and not args.smoke:
+        about = f"Medians of runs in turns, {args.threads} threads; a ratio below 1 means that torchdls is faster."
+        replace_section(Path(__file__).parents[1] / "README.md", "speed", f"{about}\n\n{text}")
 
 
 if __name__ == "__main__":

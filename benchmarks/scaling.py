@@ -1,7 +1,7 @@
-"""How time and memory grow: `python benchmarks/scaling.py` (about two minutes; add --smoke, or --largest 4096).
+"""How time and memory grow: `python benchmarks/scaling.py` (some minutes; add --smoke, or --largest 1024).
 
-Each point is a process of its own, so that its peak memory is its own. Prints the fitted exponent of time in pixels,
-and draws docs/scaling.png.
+Each point is a process of its own, so that its peak memory is its own. Prints the fitted exponent of time in pixels
+(from 128^2 to 2048^2), draws docs/scaling.png and says so in the README.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from statistics import median
 from typing import Any
 
 import torch
-from _report import results_folder, write_json
+from _report import replace_section, results_folder, write_json
 from _timing import fresh_process, peak_megabytes
 
 from torchdls import DLS, add_noise
@@ -53,10 +53,11 @@ def measured(size: int, n: int = 1, iterations: int = 5, threads: int = 2) -> di
     return result
 
 
-def exponent(points: list[dict[str, Any]], least: int = 128) -> float:
-    """Least-squares slope of log time over log pixels, from `least` pixels a side on."""
-    x = torch.tensor([2 * math.log(p["size"]) for p in points if p["size"] >= least], dtype=torch.float64)
-    y = torch.tensor([math.log(p["seconds"]) for p in points if p["size"] >= least], dtype=torch.float64)
+def exponent(points: list[dict[str, Any]], least: int = 128, most: int = 2048) -> float:
+    """Least-squares slope of log time over log pixels, from `least` to `most` pixels a side."""
+    points = [p for p in points if least <= p["size"] <= most]
+    x = torch.tensor([2 * math.log(p["size"]) for p in points], dtype=torch.float64)
+    y = torch.tensor([math.log(p["seconds"]) for p in points], dtype=torch.float64)
     return float(((x - x.mean()) * (y - y.mean())).sum() / (x - x.mean()).square().sum())
 
 
@@ -93,7 +94,7 @@ def draw(curves: dict[str, list[dict[str, Any]]], path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="tiny sizes, to see that it runs")
-    parser.add_argument("--largest", type=int, default=2048, help="side of the largest surface")
+    parser.add_argument("--largest", type=int, default=4096, help="side of the largest surface")
     parser.add_argument("--point", nargs=4, type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.point:
@@ -102,8 +103,8 @@ def main() -> None:
     sizes = [32, 48] if args.smoke else [s for s in (64, 128, 256, 512, 1024, 2048, 4096) if s <= args.largest]
     many = 1 if args.smoke else 2
     curves = {
-        "pixels, 1 thread": [measured(s, threads=1) for s in sizes],
-        "pixels, 2 threads": [measured(s, threads=many) for s in sizes],
+        "pixels, 1 thread": [measured(s, iterations=3 if s > 1024 else 5, threads=1) for s in sizes],
+        "pixels, 2 threads": [measured(s, iterations=3 if s > 1024 else 5, threads=many) for s in sizes],
         "batch of 64 x 64": [measured(64, n=n, threads=many) for n in ((1,) if args.smoke else (1, 4, 16, 64))],
         "iterations at 256 x 256": [
             measured(sizes[-1] if args.smoke else 256, iterations=k, threads=many)
@@ -115,7 +116,22 @@ def main() -> None:
         print(f"{name}: time grows as pixels^{slope:.2f}")
     folder = results_folder(args.smoke)
     write_json(folder / "scaling.json", exponents=slopes, curves=curves)
-    draw(curves, folder / "scaling.png" if args.smoke else Path(__file__).parents[1] / "docs" / "scaling.png")
+    root = Path(__file__).parents[1]
+    draw(curves, folder / "scaling.png" if args.smoke else root / "docs" / "scaling.png")
+    if not args.smoke:
+        replace_section(root / "README.md", "scaling", summary(curves["pixels, 2 threads"], slopes))
+
+
+def summary(points: list[dict[str, Any]], slopes: dict[str, float]) -> str:
+    """What the README says of it."""
+    largest = points[-1]
+    share = largest["megabytes"] / largest["codes_megabytes"]
+    growth = " and ".join(f"pixels^{slope:.2f} ({name.split(', ')[1]})" for name, slope in slopes.items())
+    return (
+        f"![Time and memory of DLS](docs/scaling.png)\n\nAn iteration takes time in proportion to {growth}. At "
+        f"{largest['size']} x {largest['size']} it takes {largest['seconds']:.1f} s, and the whole run "
+        f"{largest['megabytes'] / 1024:.1f} GB: {share:.1f} times the codes."
+    )
 
 
 if __name__ == "__main__":
