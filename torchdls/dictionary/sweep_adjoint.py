@@ -33,6 +33,11 @@ class Codes(NamedTuple):
         rows, columns = B.nonzero(as_tuple=True)
         return Codes(list(columns.split(counts)), list(B[rows, columns].split(counts)))
 
+    @property
+    def n_codes(self) -> int:
+        """How many there are."""
+        return sum(map(len, self.patches))
+
     def spread(self, values: list[Tensor], length: int) -> Tensor:
         """(K, L) other values at their places, 0 elsewhere."""
         rows = [v.new_zeros(length).index_copy_(0, s, v) for s, v in zip(self.patches, values, strict=True)]
@@ -61,17 +66,17 @@ class Sweep(NamedTuple):
     unused: Unused
     learn: bool
 
-    def pull(self, R: Tensor, gR: Tensor, gD: Tensor, gB: Tensor) -> Slopes:
+    def pull(self, R: Tensor, gR: Tensor, gD: Tensor, g_codes: list[Tensor]) -> Slopes:
         """The adjoint.
 
         Args:
             R: (L, n) residual after the sweep; overwritten by the one before it.
             gR: (L, n) gradient with respect to it; overwritten by that with respect to the one before.
             gD: (n, K) gradient with respect to the dictionary after the sweep.
-            gB: (K, L) gradient with respect to the codes after it.
+            g_codes: gradients with respect to the nonzero codes of each atom after it.
         """
-        new_codes = [g[s] for g, s in zip(gB, self.codes_after.patches, strict=True)]
-        slopes = Slopes(torch.zeros_like(gD) if self.learn else gD.clone(), list(new_codes), gR.new_zeros(len(gR)))
+        new_codes = list(g_codes)
+        slopes = Slopes(torch.zeros_like(gD) if self.learn else gD.clone(), list(g_codes), gR.new_zeros(len(gR)))
         atoms = range(self.D.shape[-1])
         if self.order == "atom" and self.learn:
             for i in reversed(atoms):

@@ -63,6 +63,11 @@ class Kept(NamedTuple):
         values = torch.where(used, state.B.flatten(1)[surfaces, places], 0)
         return Kept(state.z, state.D, values, R, places.to(torch.int32), used)
 
+    @property
+    def n_codes(self) -> list[int]:
+        """How many codes of each surface are not zero."""
+        return self.used.sum(1).tolist()
+
     def codes(self, model: Model) -> Tensor:
         """(N, K, L) all of them."""
         rows, columns = model.patches.grid(self.z.shape)
@@ -180,12 +185,11 @@ class _Run(torch.autograd.Function):
         z, D, values, R = ctx.saved_tensors
         states = [run.kept(z, D, values, R)]
         states += [Kept.of(state) for state, *_ in run.iterations(states[0])]
-        end = states[-1]
-        slopes = [torch.zeros_like(t) if g is None else g for t, g in zip(end[:3], (gz, gD, gv), strict=True)]
+        slopes = [torch.zeros_like(t) if g is None else g for t, g in zip(states[-1][:3], (gz, gD, gv), strict=True)]
         total: list[Tensor | None] = [None] * len(_tensors(run.model))
         g_R = None
         for i in reversed(range(len(states) - 1)):
-            back = _Back(run, states[i], states[i + 1], run.first and i == 0)
+            back = _Back(run, after=states.pop(), before=states[-1], first=run.first and i == 0)
             slopes, g_R, leaves = back.pull(slopes, None if g_costs is None else g_costs[:, i])
             total = [a if b is None else b if a is None else a + b for a, b in zip(total, leaves, strict=True)]
         return None, *slopes, g_R, *total
@@ -243,8 +247,8 @@ class _Back(NamedTuple):
         gR = _inside(patches.extract(folded), model)
         passed = None if pays is None else torch.where(pays, 0, gR)
         gR = gR if pays is None else torch.where(pays, gR, 0)
-        gB = self.after._replace(values=torch.where(self.after.used, gv, 0)).codes(model)
-        gR, gD, gv, g_mu = self._through_sweep(R, gR, D, gD, gB, codes, codes_after)
+        g_codes = self._of_atoms(self.after._replace(values=torch.where(self.after.used, gv, 0)), codes_after)
+        gR, gD, gv, g_mu = self._through_sweep(R, gR, D, gD, g_codes, codes, codes_after)
         gR = gR if passed is None else gR + passed
         leaves[-1] = g_mu if leaves[-1] is None else leaves[-1] + g_mu
         if self.before.R is not None:
@@ -265,22 +269,50 @@ class _Back(NamedTuple):
         """Whether surfaces have dictionaries of their own; else their patches lie side by side."""
         return len(D) == len(self.run.model.mu)
 
+    def _of_atoms(self, kept: Kept, codes: list[Codes]) -> list[list[Tensor]]:
+        """The values kept, atom by atom, at the places of `codes`."""
+        if len(codes) == len(kept.values) and all(c.n_codes == n for c, n in zip(codes, kept.n_codes, strict=True)):
+            return [
+                list(v[: c.n_codes].split([len(s) for s in c.patches])) for v, c in zip(kept.values, codes, strict=True)
+            ]
+        dense = _rows(kept.codes(self.run.model), self._alone(kept.D))
+        return [[b[s] for b, s in zip(B, c.patches, strict=True)] for B, c in zip(dense, codes, strict=True)]
+
+    def _as_kept(self, values: list[list[Tensor]], codes: list[Codes], length: int) -> Tensor:
+        """The reverse, at the places kept before the iteration."""
+        N = len(self.before.values)
+        if len(codes) == N:
+            kept = torch.zeros_like(self.before.values)
+            for row, own in zip(kept, values, strict=True):
+                joined = torch.cat(own)
+                row[: len(joined)] = joined
+            return kept
+        dense = codes[0].spread(values[0], length).unflatten(1, (N, -1)).transpose(0, 1)
+        return torch.where(self.before.used, dense.flatten(1).gather(1, self.before.places.long()), 0)
+
     def _through_sweep(
-        self, R: Tensor, gR: Tensor, D1: Tensor, gD1: Tensor, gB: Tensor, codes: list[Codes], codes_after: list[Codes]
+        self,
+        R: Tensor,
+        gR: Tensor,
+        D1: Tensor,
+        gD1: Tensor,
+        g_codes: list[list[Tensor]],
+        codes: list[Codes],
+        codes_after: list[Codes],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Gradients in the residual, the dictionary, the nonzero codes and mu before the sweep.
 
         Unless R was given, it stands for P z - D b, and its share is handed on to D and b.
         """
         dls, D, alone = self.run.dls, self.before.D, self._alone(D1)
-        gB, mu = _rows(gB, alone), self.run.model.mu[:, None].expand(-1, gB.shape[-1])
         learner = dls.learner if isinstance(dls.learner, SoupDIL) else SoupDIL("block")
+        mu, found = self.run.model.mu[:, None].expand(-1, R.shape[-1]), []
         R, pull = (t.mT if alone else t.mT.flatten(0, 1)[None] for t in (R, gR))
-        mu, found = mu if alone else mu.flatten()[None], []
+        mu = mu if alone else mu.flatten()[None]
         options = dls.bound, dls.threshold, learner.order, learner.unused, dls.learn
         for i in range(len(D)):
             sweep = Sweep(D[i], codes[i], D1[i], codes_after[i], mu[i], *options)
-            found.append(sweep.pull(R[i], pull[i], gD1[i], gB[i]))
+            found.append(sweep.pull(R[i], pull[i], gD1[i], g_codes[i]))
         D_slopes = torch.stack([f.D for f in found])
         values = [f.codes for f in found]
         gR = pull.reshape(gR.mT.shape).mT
@@ -288,9 +320,8 @@ class _Back(NamedTuple):
             gR = _inside(gR, self.run.model)
             pull = gR.mT if alone else gR.mT.flatten(0, 1)[None]
             values = [self._hand_on(D[i], codes[i], pull[i], D_slopes[i], values[i]) for i in range(len(D))]
-        dense = _columns([c.spread(v, pull.shape[1]) for c, v in zip(codes, values, strict=True)], len(gR))
-        kept = torch.where(self.before.used, dense.flatten(1).gather(1, self.before.places.long()), 0)
-        return gR, D_slopes, kept, torch.stack([f.mu for f in found]).view(len(gR), -1).sum(1)
+        g_mu = torch.stack([f.mu for f in found]).view(len(gR), -1).sum(1)
+        return gR, D_slopes, self._as_kept(values, codes, pull.shape[1]), g_mu
 
     def _hand_on(self, D: Tensor, codes: Codes, pull: Tensor, D_slopes: Tensor, values: list[Tensor]) -> list[Tensor]:
         """R = P z - D b before the sweep: what R is given goes on to D (added to `D_slopes`) and to the codes."""
@@ -304,11 +335,6 @@ class _Back(NamedTuple):
 def _rows(B: Tensor, alone: bool) -> Tensor:
     """(N, K, L) codes, or (1, K, N L) with the patches of all surfaces side by side."""
     return B if alone else B.transpose(0, 1).flatten(1)[None]
-
-
-def _columns(dense: list[Tensor], N: int) -> Tensor:
-    """Back from `_rows`: (N, K, L)."""
-    return torch.stack(dense) if len(dense) == N else dense[0].unflatten(1, (N, -1)).transpose(0, 1)
 
 
 def _inside(R: Tensor, model: Model) -> Tensor:

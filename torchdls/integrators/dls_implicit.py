@@ -12,6 +12,7 @@ d(z, b) = K^{-1} (df - dK (z, b)), whatever the number of iterations. The suppor
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._tape import recorded, taped
 from torchdls.dictionary.thresholds import Threshold
 from torchdls.integrators.dls_state import Model
 from torchdls.operators import GradientOperator, Patches
@@ -35,10 +37,13 @@ _CHUNK = 4096
 
 
 class _Setting(NamedTuple):
+    """What the solve needs besides tensors; `codes` tells whether the codes are asked for, or the height alone."""
+
     patches: Patches
     pixel_size: tuple[float, float]
     tol: float
     max_iter: int
+    codes: bool = True
 
 
 def at_fixed_point(
@@ -66,24 +71,29 @@ def at_fixed_point(
     free = (B != 0) & (B.abs() < bound)
     f_z = GradientOperator("forward", fields.steps).adjoint(w * v)
     f_z = f_z if fields.anchor is None else f_z + r * fields.anchor
-    f_b = torch.zeros_like(B) if threshold == "hard" else -2 * lam * model.mu[:, None, None] * B.sign() * free
-    held = torch.where(free, 0, B)
-    if bound < float("inf"):
-        E = _inside(D @ held, valid)
-        f_z = f_z + 2 * lam[..., None] * patches.adjoint(E, z.shape)
-        f_b = f_b - 2 * lam * (D.mT @ E) * free
+    f_b = None if threshold == "hard" else -2 * lam * model.mu[:, None, None] * B.sign() * free
     setting = _Setting(patches, fields.steps, tol, max_iter)
+    if math.isinf(bound):
+        found: tuple[Tensor, Tensor] = _FixedPoint.apply(f_z, f_b, w, r, lam, D, free, valid, z, B, setting)
+        return found
+    held = torch.where(free, 0, B)
+    E = _inside(D @ held, valid)
+    f_z = f_z + 2 * lam[..., None] * patches.adjoint(E, z.shape)
+    f_b = (0 if f_b is None else f_b) - 2 * lam * (D.mT @ E) * free
     z, b = _FixedPoint.apply(f_z, f_b, w, r, lam, D, free, valid, z, B - held, setting)
     return z, b + held
 
 
 class _FixedPoint(torch.autograd.Function):
-    """(z, b) = K(w, r, lam, D)^{-1} f. The first call is given the solution; the calls of its derivatives solve."""
+    """(z, b) = K(w, r, lam, D)^{-1} f. The first call is given the solution; the calls of its derivatives solve.
+
+    None for f_b is 0. Codes are found where they are needed alone; elsewhere zeros that take no memory stand for them.
+    """
 
     @staticmethod
     def forward(
         f_z: Tensor,
-        f_b: Tensor,
+        f_b: Tensor | None,
         w: Tensor,
         r: Tensor,
         lam: Tensor,
@@ -105,11 +115,17 @@ class _FixedPoint(torch.autograd.Function):
         ctx.save_for_backward(*kept)
         ctx.save_for_forward(*kept)
         ctx.setting = setting
+        ctx.set_materialize_grads(False)
 
     @staticmethod
-    def backward(ctx: Any, dz: Tensor, db: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, dz: Tensor | None, db: Tensor | None) -> tuple[Tensor | None, ...]:
         z, b, w, r, lam, D, free, valid = ctx.saved_tensors
-        x, y = _FixedPoint.apply(dz, db * free, w, r, lam, D, free, valid, None, None, ctx.setting)
+        dz, db = torch.zeros_like(z) if dz is None else dz, None if db is None else db * free
+        kept = [t for t in (dz, db, z, b, w, r, lam, D) if t is not None]
+        wanted = any(ctx.needs_input_grad[i] for i in (1, 4, 5))
+        # Inside a transform of functions, outer levels may want what this one does not.
+        setting = ctx.setting._replace(codes=wanted or db is not None or (recorded(*kept) and not taped(*kept)))
+        x, y = _FixedPoint.apply(dz, db, w, r, lam, D, free, valid, None, None, setting)
         a, patches = GradientOperator("forward", ctx.setting.pixel_size), ctx.setting.patches
         dw = -a(x) * a(z) if ctx.needs_input_grad[2] else None
         dr = -x * z if ctx.needs_input_grad[3] else None
@@ -118,7 +134,7 @@ class _FixedPoint(torch.autograd.Function):
             Rx, Rz = (_inside(patches.extract(t) - D @ c, valid) for t, c in ((x, y), (z, b)))
             dlam = -2 * (Rx * Rz).sum((1, 2), keepdim=True)
             dD = 2 * lam * (Rx @ b.mT + Rz @ y.mT)
-        return x, y, dw, dr, dlam, dD, None, None, None, None, None
+        return x, y if ctx.needs_input_grad[1] else None, dw, dr, dlam, dD, None, None, None, None, None
 
     @staticmethod
     def jvp(
@@ -134,18 +150,23 @@ class _FixedPoint(torch.autograd.Function):
         z, b, w, r, lam, D, free, valid = ctx.saved_tensors
         a, patches = GradientOperator("forward", ctx.setting.pixel_size), ctx.setting.patches
         x = torch.zeros_like(z) if df_z is None else df_z
-        y = torch.zeros_like(b) if df_b is None else df_b
+        y = df_b
         if dw is not None:
             x = x - a.adjoint(dw * a(z))
         if dr is not None:
             x = x - dr * z
         R = _inside(patches.extract(z) - D @ b, valid) if dlam is not None or dD is not None else None
         if dlam is not None and R is not None:
-            x, y = x - 2 * dlam[..., None] * patches.adjoint(R, z.shape), y + 2 * dlam * (D.mT @ R)
+            x, y = (
+                x - 2 * dlam[..., None] * patches.adjoint(R, z.shape),
+                (0 if y is None else y) + 2 * dlam * (D.mT @ R),
+            )
         if dD is not None and R is not None:
             E = _inside(dD @ b, valid)
-            x, y = x + 2 * lam[..., None] * patches.adjoint(E, z.shape), y + 2 * lam * (dD.mT @ R - D.mT @ E)
-        return _FixedPoint.apply(x, y * free, w, r, lam, D, free, valid, None, None, ctx.setting)
+            x = x + 2 * lam[..., None] * patches.adjoint(E, z.shape)
+            y = (0 if y is None else y) + 2 * lam * (dD.mT @ R - D.mT @ E)
+        y = None if y is None else y * free
+        return _FixedPoint.apply(x, y, w, r, lam, D, free, valid, None, None, ctx.setting)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
@@ -164,41 +185,57 @@ class _System(NamedTuple):
     valid: Tensor | None
     setting: _Setting
 
-    def solve(self, f_z: Tensor, f_b: Tensor) -> tuple[Tensor, Tensor]:
+    def solve(self, f_z: Tensor, f_b: Tensor | None) -> tuple[Tensor, Tensor]:
         """K^{-1} f, the codes eliminated patch by patch.
 
         With X = M P z, the codes of a patch are b = G^{-1} (D^T X + f_b / 2 lam) on its support, G = D^T M D there.
         What is left for the height is A^T w A z + r z + 2 lam fold(X - M D b).
         """
         codes_of = self._codes_of()
-        strength = 2 * self.lam
-        b0 = f_b / torch.where(strength > 0, strength, 1)
+        parts = [slice(i, i + _CHUNK) for i in range(0, self.free.shape[-1], _CHUNK)]
 
-        def apply(z: Tensor) -> Tensor:
-            X = self._patches(z).mT  # patch by patch, as they lie in memory
-            X.baddbmm_(codes_of(X @ self.D), self.D.mT, alpha=-1)
-            return self._data(z) + self._fold(_inside(X.mT, self.valid))
+        def less_codes(X: Tensor) -> Tensor:
+            """X - M D G^{-1} D^T X, folded."""
+            X = X.mT  # patch by patch, as they lie in memory
+            for part in parts:
+                X[:, part].baddbmm_(codes_of(X[:, part] @ self.D, part), self.D.mT, alpha=-1)
+            return self._fold(_inside(X.mT, self.valid))
 
-        held = self.D @ codes_of(b0.mT.contiguous()).mT
-        z = self._cg(apply, f_z + self._fold(_inside(held, self.valid)))
-        return z, codes_of(self._patches(z).mT @ self.D + b0.mT).mT
+        def codes(x: Tensor) -> Tensor:
+            """G^{-1} x of all patches (N, L, K), written to x."""
+            for part in parts:
+                x[:, part] = codes_of(x[:, part].clone(), part)
+            return x
 
-    def _codes_of(self) -> Callable[[Tensor], Tensor]:
-        """The map from D^T X (N, L, K) to G^{-1} D^T X on the support of each patch; it may overwrite its argument."""
+        b0 = None
+        if f_b is not None:
+            strength = 2 * self.lam
+            b0 = (f_b / torch.where(strength > 0, strength, 1)).mT
+            f_z = f_z + self._fold(
+                _inside(self.D @ codes(b0.clone(memory_format=torch.contiguous_format)).mT, self.valid)
+            )
+        z = self._cg(lambda z: self._data(z) + less_codes(self._patches(z)), f_z)
+        if not self.setting.codes:
+            return z, z.new_zeros(()).expand(self.free.shape)
+        x = self._patches(z).mT @ self.D
+        return z, codes(x if b0 is None else x.add_(b0)).mT
+
+    def _codes_of(self) -> Callable[[Tensor, slice], Tensor]:
+        """The map from D^T X (N, l, K) to G^{-1} D^T X on the support of some patches; it overwrites its argument."""
         free = self.free.mT.contiguous()
         gram = self.D.mT @ self.D
         eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
         if self.valid is None and bool((gram - eye).abs().max() < 100 * torch.finfo(gram.dtype).eps):
-            kept = free.to(gram.dtype)
-            return lambda x: x.mul_(kept)
+            return lambda x, part: x.mul_(free[:, part])
         size = max(int(free.sum(-1).max()), 1)
         places = torch.cat([f.to(torch.uint8).topk(size, -1).indices for f in free.split(_CHUNK, 1)], 1)
         used = free.gather(2, places)
         inverse = torch.cat([self._inverse_grams(*c) for c in self._chunks(places, used)], 1)
 
-        def solve(x: Tensor) -> Tensor:
-            codes = (inverse @ torch.where(used, x.gather(2, places), 0)[..., None])[..., 0]
-            return x.zero_().scatter_(2, places, torch.where(used, codes, 0))
+        def solve(x: Tensor, part: slice) -> Tensor:
+            here, live = places[:, part], used[:, part]
+            codes = (inverse[:, part] @ torch.where(live, x.gather(2, here), 0)[..., None])[..., 0]
+            return x.zero_().scatter_(2, here, torch.where(live, codes, 0))
 
         return solve
 
