@@ -11,6 +11,7 @@ support is frozen: only the patches of nonzero codes are touched.
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -18,6 +19,9 @@ from torch import Tensor
 
 from torchdls.dictionary.soup_dil import Order, Unused
 from torchdls.dictionary.thresholds import Threshold
+
+# Patches of one atom that are worked on at a time.
+_PART = 4096
 
 
 class Codes(NamedTuple):
@@ -31,7 +35,8 @@ class Codes(NamedTuple):
         """From all codes (K, L)."""
         counts = B.count_nonzero(1).tolist()
         rows, columns = B.nonzero(as_tuple=True)
-        return Codes(list(columns.split(counts)), list(B[rows, columns].split(counts)))
+        values = B[rows, columns]
+        return Codes(list(columns.clone().split(counts)), list(values.split(counts)))  # without the rows beside them
 
     @property
     def n_codes(self) -> int:
@@ -91,9 +96,9 @@ class Sweep(NamedTuple):
 
     def _undo_atom(self, i: int, R: Tensor, gR: Tensor, gD: Tensor, new_codes: list[Tensor], slopes: Slopes) -> None:
         d, d1, s, b = self.D[:, i], self.D_after[:, i], self.codes_after.patches[i], self.codes_after.values[i]
-        R.index_add_(0, s, torch.outer(b, d1 - d))
-        residual, pull, square = R[s], gR[s], b @ b
-        through, h = pull.mT @ b, residual.mT @ b + d * square
+        _add(R, s, b, d1 - d)
+        square, through = b @ b, _weigh(gR, s, b)
+        h = _weigh(R, s, b) + d * square
         to_atom, size = gD[:, i] - through, h.norm()
         slopes.D[:, i] += through
         if not size > 0:  # no patch uses it
@@ -101,19 +106,18 @@ class Sweep(NamedTuple):
             return
         gh = (to_atom - d1 * (d1 @ to_atom)) / size
         slopes.D[:, i] += gh * square
-        new_codes[i] = new_codes[i] + pull @ (d - d1) + residual @ gh + 2 * (d @ gh) * b
-        gR.index_add_(0, s, torch.outer(b, gh))
+        new_codes[i] = new_codes[i] + _project(gR, s, d - d1) + _project(R, s, gh) + 2 * (d @ gh) * b
+        _add(gR, s, b, gh)
 
     def _undo_row(self, i: int, R: Tensor, gR: Tensor, new_codes: list[Tensor], slopes: Slopes) -> None:
         d, (s, s1) = self.D[:, i], (self.codes.patches[i], self.codes_after.patches[i])
         b, b1 = self.codes.values[i], self.codes_after.values[i]
-        R.index_add_(0, s, torch.outer(-b, d))
-        R.index_add_(0, s1, torch.outer(b1, d))
-        pull, pull1 = gR[s], gR[s1]
-        gx = self._through_threshold(b1, s1, new_codes[i] - pull1 @ d, slopes.mu)
-        slopes.D[:, i] += pull.mT @ b - pull1.mT @ b1 + R[s1].mT @ gx
-        slopes.codes[i] = pull @ d + gR.new_zeros(len(gR)).index_copy_(0, s1, gx)[s]
-        gR.index_add_(0, s1, torch.outer(gx, d))
+        _add(R, s, -b, d)
+        _add(R, s1, b1, d)
+        gx = self._through_threshold(b1, s1, new_codes[i] - _project(gR, s1, d), slopes.mu)
+        slopes.D[:, i] += _weigh(gR, s, b) - _weigh(gR, s1, b1) + _weigh(R, s1, gx)
+        slopes.codes[i] = _project(gR, s, d) + gR.new_zeros(len(gR)).index_copy_(0, s1, gx)[s]
+        _add(gR, s1, gx, d)
 
     def _through_threshold(self, b: Tensor, patches: Tensor, gb: Tensor, g_mu: Tensor) -> Tensor:
         """From nonzero codes to what they were before the threshold; codes at the bound do not move."""
@@ -126,3 +130,23 @@ class Sweep(NamedTuple):
             moved = torch.ones_like(b, dtype=torch.bool)
         g_mu.index_add_(0, patches, torch.where(moved, -b.sign() * g, 0))
         return g
+
+
+# Some rows s of X (L, n), a part of them at a time: an atom that all patches use would need a copy of X.
+
+
+def _project(X: Tensor, s: Tensor, d: Tensor) -> Tensor:
+    """X_s d."""
+    return torch.cat([X[part] @ d for part in s.split(_PART)])
+
+
+def _weigh(X: Tensor, s: Tensor, b: Tensor) -> Tensor:
+    """X_s^T b."""
+    parts = zip(s.split(_PART), b.split(_PART), strict=True)
+    return reduce(torch.add, (X[part].mT @ c for part, c in parts))
+
+
+def _add(X: Tensor, s: Tensor, b: Tensor, d: Tensor) -> None:
+    """X_s += b d^T."""
+    for part, c in zip(s.split(_PART), b.split(_PART), strict=True):
+        X.index_add_(0, part, torch.outer(c, d))
