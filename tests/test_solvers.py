@@ -97,6 +97,17 @@ def test_random_weights_cost_few_iterations(mask, dtype, tol):
     assert_solves(result.height.double(), v, w_e, atol=1e-3 if dtype == torch.float32 else 1e-8)
 
 
+@pytest.mark.parametrize("scale", [1e-60, 1e60])
+def test_the_scale_of_the_weights_does_not_matter(scale):
+    """Not even beyond what single precision can hold, in which the preconditioner works."""
+    inside = MASKS["disk"](80, 70)
+    weight = 0.1 + torch.rand(1, 1, 80, 70, dtype=torch.float64, generator=seeded(1))
+    v, w = edge_slopes(random_field(1, 2, 80, 70), inside, weight)
+    expected, found = solve(v, w, tol=1e-10), solve(v, scale * w, tol=1e-10)
+    assert abs(int(found.iterations) - int(expected.iterations)) <= 1
+    torch.testing.assert_close(found.height, expected.height, rtol=0, atol=1e-7)
+
+
 def test_weights_that_change_slowly_by_orders_of_magnitude():
     y, x = torch.meshgrid(torch.linspace(0, 3, 80), torch.linspace(0, 3, 70), indexing="ij")
     weight = (10 ** (2 * torch.sin(x) * torch.cos(y)))[None, None].double()

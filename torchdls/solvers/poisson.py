@@ -294,9 +294,9 @@ def preconditioner(w: Tensor, r: Tensor, pixel_size: tuple[float, float]) -> Lin
         diagonal = edge_ends(w / scale.square()) + r
         inverse = torch.where(alive, 1 / torch.where(alive, diagonal, 1), 0)
         return lambda b: b * inverse
-    s = torch.where(alive, ((k + rho) / total).sqrt(), 0).float()
-    direct = direct_map((w.shape[-2], w.shape[-1]), rho.float(), pixel_size, s)
-    return lambda b: direct(s * b.float()).mul_(s).to(b.dtype)
+    s = torch.where(alive, ((k + rho) / total).sqrt(), 0)
+    direct = direct_map((w.shape[-2], w.shape[-1]), rho.float(), pixel_size, s.float())
+    return lambda b: s * direct((s * b).float())
 
 
 def _local_weight(w: Tensor) -> Tensor:
