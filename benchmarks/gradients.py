@@ -1,4 +1,4 @@
-"""What derivatives cost: `python benchmarks/gradients.py` (about two minutes; --smoke for a short run).
+"""What derivatives cost: `python benchmarks/gradients.py` (about three minutes; --smoke for a short run).
 
 Time of the backward pass, or of both passes, over that of a plain forward pass that records nothing, interleaved; and
 peak memory over that of the plain forward, each in a process of its own. Writes gradients.json and gradients.md.
@@ -45,6 +45,7 @@ def cases(size: int) -> dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], 
         "DLS implicit, 20 iterations": (fixed, "backward", 1.0, size),
         "DLS unrolled, paper's order": (atom, "both", 8.0, size),
         "DLS unrolled, block order": (block, "both", 8.0, size),
+        "DLS unrolled, checkpoint": (DLS(n_iter=10, tol=0.0, checkpoint=True), "both", float("nan"), size),
     }
 
 
