@@ -93,5 +93,5 @@ def spams_dictionary(spams: Any, X: np.ndarray, D: np.ndarray, passes: float, th
 
 def spams_error(spams: Any, X: np.ndarray, D: np.ndarray) -> float:
     """||X - D B||^2 / ||X||^2 with five nonzeros per column by orthogonal matching pursuit."""
-    B = spams.omp(X, np.asfortranarray(D), L=5, eps=0.0, numThreads=-1)
+    B = spams.omp(X, np.asfortranarray(D), L=5, eps=0.0, numThreads=1)
     return float(np.square(X - D @ B.toarray()).sum() / np.square(X).sum())
