@@ -133,10 +133,17 @@ def run(
             seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
             gain = plain / found.amin(0)
             for k, snr in enumerate(snrs):
-                values = dict(zip(MEASURES, gain[:, k].tolist(), strict=True))
+                values = {
+                    m: g if 0 < g < math.inf else None for m, g in zip(MEASURES, gain[:, k].tolist(), strict=True)
+                }
                 rows.append({"surface": surface.name, "snr": snr, "method": name, **values})
             print(f"{surface.name:10} {name:28}", *(f"{a:.2f}/{b:.2f}" for a, b in gain[:2].T), flush=True)
     return rows, {name: s / fields for name, s in seconds.items()}
+
+
+def known(rows: Iterable[dict[str, Any]], measure: str) -> list[float]:
+    """The gains in one measure; a row is left out where an error is 0 in single precision."""
+    return [r[measure] for r in rows if r[measure] is not None]
 
 
 def geometric_mean(values: Sequence[float]) -> float:
@@ -151,10 +158,10 @@ def table(rows: list[dict[str, Any]], seconds: dict[str, float]) -> str:
         mine = [r for r in rows if r["method"] == name]
 
         def cell(chosen: list[dict[str, Any]]) -> str:
-            return " / ".join(f"{geometric_mean([r[m] for r in chosen]):.2f}" for m in MEASURES[:3])
+            return " / ".join(f"{geometric_mean(known(chosen, m)):.2f}" for m in MEASURES[:3])
 
         low = [r for r in mine if r["snr"] <= 20]
-        worst = " / ".join(f"{1 / min(r[m] for r in mine):.3f}" for m in MEASURES[:3])
+        worst = " / ".join(f"{1 / min(known(mine, m)):.3f}" for m in MEASURES[:3])
         lines.append([name, cell(low), *(cell([r for r in mine if r["snr"] == s]) for s in snrs), worst])
     note = "Cells: RMSE / 1-SSIM at the surface's data range / 1-SSIM at the full range of its heights."
     return markdown_table(["gain", "up to 20 dB", *(f"{s} dB" for s in snrs), "worst row"], lines) + "\n" + note + "\n"
@@ -178,19 +185,28 @@ def picture(rows: list[dict[str, Any]], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    names = [n for n in dict.fromkeys(r["method"] for r in rows) if not n.startswith("SlopeDLS,")]
+    figure, axes = pyplot.subplots(1, 2, figsize=(11, 3.8), layout="constrained")
     snrs = sorted({r["snr"] for r in rows})
     for axis, measure in zip(axes, MEASURES[:2], strict=True):
         for surface in dict.fromkeys(r["surface"] for r in rows):
             mine = [r for r in rows if r["surface"] == surface and r["method"] == "SlopeDLS"]
-            axis.plot(snrs, [r[measure] for r in mine], color="0.85", zorder=1)
-        for name in dict.fromkeys(r["method"] for r in rows):
-            means = [geometric_mean([r[measure] for r in rows if r["method"] == name and r["snr"] == s]) for s in snrs]
-            axis.plot(snrs, means, marker="o", markersize=3, label=name)
+            axis.plot(snrs, [r[measure] or math.nan for r in mine], color="0.85", zorder=1)
+        for k, name in enumerate(names):
+            levels = [[r for r in rows if r["method"] == name and r["snr"] == s] for s in snrs]
+            means = [geometric_mean(known(level, measure)) for level in levels]
+            width = 2.5 if name == "SlopeDLS" else 1.2
+            axis.plot(snrs, means, f"C{k}", marker="o", markersize=3, linewidth=width, label=name)
+        axis.plot([], [], color="0.85", label="SlopeDLS, each surface")
         axis.axhline(1, color="black", linewidth=0.6)
         axis.set(xlabel="SNR (dB)", ylabel=f"error of least squares / error ({measure})", yscale="log")
-    axes[0].legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+        axis.set_ylim(bottom=0.5)
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter("")
+        axis.set_yticks([0.5, 1, 2, 5, 10, 20][: 3 if measure == "rmse" else 6])
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
+    figure.savefig(path, dpi=100)
+    pyplot.close(figure)
 
 
 def main() -> None:
