@@ -270,15 +270,18 @@ def rows(results: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
             yield result["name"], name, f"{s['median_ms']:.2f}", spread, memory, verdict, against
 
 
+def milliseconds(x: float) -> str:
+    return f"{x:,.1f}" if x < 100 else f"{x:,.0f}"
+
+
 def summary(results: dict[str, Any]) -> str:
     """The table of the README: ours beside what it is held against."""
     header = ("task", "torchdls, ms", "beside it", "ms", "ratio", "target")
     lines = []
     for r in results.values():
         ours, other = (r["candidates"][r[k]]["median_ms"] for k in ("ours", "against"))
-        lines.append(
-            (r["name"], f"{ours:.3g}", r["against"], f"{other:.3g}", f"{r['ratio']:.2f}", f"{r['target']:.2f}")
-        )
+        ratios = f"{r['ratio']:.2f}", f"{r['target']:.2f}"
+        lines.append((r["name"], milliseconds(ours), r["against"], milliseconds(other), *ratios))
     return markdown_table(header, lines)
 
 
