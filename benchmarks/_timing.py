@@ -11,6 +11,10 @@ from pathlib import Path
 from statistics import median, quantiles
 from typing import Any
 
+# Threads of OpenBLAS that have nothing to do keep a core busy for about a tenth of a second, at the cost of whoever
+# comes next; so every candidate waits for the last one's threads to go to sleep.
+_PAUSE = 0.15
+
 
 def interleaved(
     candidates: dict[str, Callable[[], Any]], seconds: float = 4.0, least: int = 3
@@ -22,6 +26,7 @@ def interleaved(
     end = time.perf_counter() + seconds
     while time.perf_counter() < end or len(next(iter(times.values()))) < least:
         for name, run in candidates.items():
+            time.sleep(_PAUSE)
             start = time.perf_counter()
             run()
             times[name].append(time.perf_counter() - start)

@@ -307,7 +307,7 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="tiny sizes, to see that it runs")
     parser.add_argument("--only", nargs="*", help="the cases to run")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=4.0, help="time for each case")
+    parser.add_argument("--seconds", type=float, default=6.0, help="time for each case")
     parser.add_argument("--no-memory", action="store_true", help="leave out the processes that measure memory")
     parser.add_argument("--alone", nargs=2, metavar=("CASE", "CANDIDATE"), help=argparse.SUPPRESS)
     args = parser.parse_args()

@@ -21,6 +21,7 @@ import numpy as np
 import scipy.fft
 import torch
 from _report import markdown_table, results_folder, write_json
+from _timing import interleaved
 
 from torchdls import (
     FrankotChellappa,
@@ -62,17 +63,6 @@ def scipy_poisson(gradient: np.ndarray) -> Callable[[], np.ndarray]:
     return run
 
 
-def interleaved(runs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Median seconds of each, the runs taking turns."""
-    times: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in range(rounds):
-        for name, run in runs.items():
-            began = time.perf_counter()
-            run()
-            times[name].append(time.perf_counter() - began)
-    return {name: median(seconds) for name, seconds in times.items()}
-
-
 def measure(n: int, dtype: torch.dtype, rounds: int) -> list[dict[str, Any]]:
     g = torch.randn(1, 2, n, n, generator=torch.Generator().manual_seed(0), dtype=dtype)
     poisson = scipy_poisson(g[0].numpy())
@@ -84,7 +74,7 @@ def measure(n: int, dtype: torch.dtype, rounds: int) -> list[dict[str, Any]]:
         first[name] = time.perf_counter() - began
     runs: dict[str, Callable[[], Any]] = {"SciPy": poisson}
     runs |= {name: (lambda m=method: m(g)) for name, method in METHODS.items()}
-    seconds = interleaved(runs, rounds)
+    seconds = {name: median(times) for name, times in interleaved(runs, 0.0, rounds).items()}
     print(f"{n} x {n}, {dtype}: LeastSquares and SciPy differ by {difference:.1e}", flush=True)
     return [
         {
@@ -112,7 +102,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="one small size, few rounds: does it run?")
     parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512])
-    parser.add_argument("--rounds", type=int, default=41)
+    parser.add_argument("--rounds", type=int, default=21)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder for the results")
     args = parser.parse_args()
