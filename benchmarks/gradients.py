@@ -66,7 +66,7 @@ def time_case(run: Callable[[torch.Tensor], torch.Tensor], what: str, g: torch.T
         spent.append(time.perf_counter() - start)
 
     times = interleaved({"plain": plain, "recorded": recorded}, seconds)
-    return median(b / a for a, b in zip(times["plain"], spent[1:], strict=True))
+    return median(b / a for a, b in zip(times["plain"], spent[1::2], strict=True))
 
 
 MODES: dict[str, dict[str, Any]] = {
