@@ -41,7 +41,7 @@ def conjugate_gradients(
         tol: a system stops once ||r|| <= tol ||b||, with r the residual of the recursion (free of rounding in x).
         max_iter: limit of iterations.
         project: orthogonal projection on the range of a singular H. Rounding leaves it, and a preconditioner that does
-            not commute with it would take what is outside for progress.
+            not commute with it would take what is outside for progress. It may overwrite its argument.
 
     A system that has stopped is frozen: its result does not depend on its neighbours in the batch.
     """

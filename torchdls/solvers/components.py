@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -33,6 +34,20 @@ class Gauge(NamedTuple):
             return torch.where(self.share > 0, flat - mean, 0).view_as(x)
         sums = torch.zeros_like(flat).scatter_add(1, self.labels, flat)
         return (flat - sums.gather(1, self.labels) * self.share).view_as(x)
+
+    def correction(self) -> Callable[[Tensor], Tensor] | None:
+        """The same for repeated use on fields that rounding alone took off, which may be overwritten; None for none."""
+        if not bool(self.share.any()):
+            return None
+        if self.labels.shape[1]:
+            return self.remove
+        inside = (self.share > 0).to(self.share.dtype)
+
+        def correct(x: Tensor) -> Tensor:
+            flat = x.flatten(1)
+            return flat.addcmul_(inside, torch.linalg.vecdot(flat, self.share)[:, None], value=-1).view_as(x)
+
+        return correct
 
 
 def connected_components(linked: Tensor) -> Tensor:

@@ -176,7 +176,7 @@ class _Solve(torch.autograd.Function):
             z0,
             tol=setting.tol,
             max_iter=setting.max_iter,
-            project=gauge.remove if bool(gauge.share.any()) else None,
+            project=gauge.correction(),
         )
         if not bool(converged.all()):
             _warn(residual, converged, setting)
