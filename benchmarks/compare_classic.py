@@ -63,7 +63,7 @@ def scipy_poisson(gradient: np.ndarray) -> Callable[[], np.ndarray]:
     return run
 
 
-def measure(n: int, dtype: torch.dtype, rounds: int) -> list[dict[str, Any]]:
+def measure(n: int, dtype: torch.dtype, duration: float) -> list[dict[str, Any]]:
     g = torch.randn(1, 2, n, n, generator=torch.Generator().manual_seed(0), dtype=dtype)
     poisson = scipy_poisson(g[0].numpy())
     difference = float((METHODS["LeastSquares"](g)[0, 0] - torch.from_numpy(poisson())).abs().max())
@@ -74,7 +74,7 @@ def measure(n: int, dtype: torch.dtype, rounds: int) -> list[dict[str, Any]]:
         first[name] = time.perf_counter() - began
     runs: dict[str, Callable[[], Any]] = {"SciPy": poisson}
     runs |= {name: (lambda m=method: m(g)) for name, method in METHODS.items()}
-    seconds = {name: median(times) for name, times in interleaved(runs, 0.0, rounds).items()}
+    seconds = {name: median(times) for name, times in interleaved(runs, duration).items()}
     print(f"{n} x {n}, {dtype}: LeastSquares and SciPy differ by {difference:.1e}", flush=True)
     return [
         {
@@ -100,16 +100,16 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--smoke", action="store_true", help="one small size, few rounds: does it run?")
+    parser.add_argument("--smoke", action="store_true", help="one small size, a short time: does it run?")
     parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512])
-    parser.add_argument("--rounds", type=int, default=21)
+    parser.add_argument("--seconds", type=float, default=6.0, help="time for each size and type")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder for the results")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    sizes, rounds = ([48], 3) if args.smoke else (args.sizes, args.rounds)
+    sizes, duration = ([48], 0.1) if args.smoke else (args.sizes, args.seconds)
     with torch.no_grad():
-        rows = [row for n in sizes for dtype in (torch.float64, torch.float32) for row in measure(n, dtype, rounds)]
+        rows = [row for n in sizes for dtype in (torch.float64, torch.float32) for row in measure(n, dtype, duration)]
     out = args.out or results_folder(args.smoke)
     path = write_json(out / "compare_classic.json", rows=rows)
     (out / "compare_classic.md").write_text(table(rows))

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import hypot, inf
 from numbers import Real
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-
-from torchdls._tape import recorded
 
 Kernel = tuple[tuple[float, ...], ...]
 
@@ -237,15 +236,71 @@ def slope_divergence(gradient: Tensor, pixel_size: tuple[float, float] = (1.0, 1
 
         (A^T v)_j = (g_{j-1} - g_{j+1}) / 2 dx + (the same along y),     g_{-1} = -g_0,  g_W = -g_{W-1}
     """
-    (gx, gy), (dx, dy) = gradient.split(1, -3), pixel_size
-    if recorded(gradient):
+    if torch.compiler.is_compiling():
+        (gx, gy), (dx, dy) = gradient.split(1, -3), pixel_size
         return torch.add(_central(gx, -1) * (0.5 / dx), _central(gy, -2), alpha=0.5 / dy)
-    divergence = torch.zeros_like(gx, memory_format=torch.contiguous_format)
-    for g, dim, half in ((gx, -1, 0.5 / dx), (gy, -2, 0.5 / dy)):
-        n = g.shape[dim]
-        for at, of, count, sign in ((1, 0, n - 1, 1), (0, 1, n - 1, -1), (0, 0, 1, -1), (n - 1, n - 1, 1, 1)):
-            divergence.narrow(dim, at, count).add_(g.narrow(dim, of, count), alpha=sign * half)
-    return divergence
+    return _SlopeDivergence.apply(gradient, pixel_size)
+
+
+class _SlopeDivergence(torch.autograd.Function):
+    """The map of `slope_divergence`, summed up in place."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(gradient: Tensor, pixel_size: tuple[float, float]) -> Tensor:
+        divergence = torch.zeros_like(gradient[..., :1, :, :], memory_format=torch.contiguous_format)
+        for channel, dim, at, of, count, factor in _stencil(gradient, pixel_size):
+            part = gradient.narrow(-3, channel, 1).narrow(dim, of, count)
+            divergence.narrow(dim, at, count).add_(part, alpha=factor)
+        return divergence
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.pixel_size = inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, change: Tensor) -> tuple[Tensor, None]:
+        return _SlopeDivergenceAdjoint.apply(change, ctx.pixel_size), None
+
+    @staticmethod
+    def jvp(ctx: Any, change: Tensor, _: None) -> Tensor:
+        return _SlopeDivergence.apply(change, ctx.pixel_size)
+
+
+class _SlopeDivergenceAdjoint(torch.autograd.Function):
+    """Its adjoint, from (N, 1, H, W) to (N, 2, H, W)."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(field: Tensor, pixel_size: tuple[float, float]) -> Tensor:
+        slopes = torch.cat([torch.zeros_like(field)] * 2, -3)
+        for channel, dim, at, of, count, factor in _stencil(field, pixel_size):
+            slopes.narrow(-3, channel, 1).narrow(dim, of, count).add_(field.narrow(dim, at, count), alpha=factor)
+        return slopes
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.pixel_size = inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, change: Tensor) -> tuple[Tensor, None]:
+        return _SlopeDivergence.apply(change, ctx.pixel_size), None
+
+    @staticmethod
+    def jvp(ctx: Any, change: Tensor, _: None) -> Tensor:
+        return _SlopeDivergenceAdjoint.apply(change, ctx.pixel_size)
+
+
+def _stencil(like: Tensor, pixel_size: tuple[float, float]) -> Iterator[tuple[int, int, int, int, int, float]]:
+    """Channel, dimension, start of the divergence and of the slopes that enter it, their number and their factor."""
+    for channel, dim in ((0, -1), (1, -2)):
+        n, half = like.shape[dim], 0.5 / pixel_size[channel]
+        yield channel, dim, 1, 0, n - 1, half
+        yield channel, dim, 0, 1, n - 1, -half
+        yield channel, dim, 0, 0, 1, -half
+        yield channel, dim, n - 1, n - 1, 1, half
 
 
 def _central(g: Tensor, dim: int) -> Tensor:
