@@ -192,6 +192,10 @@ def test_select_refuses_what_it_cannot_predict():
     mask[..., 3, 3] = False
     with pytest.raises(ValueError, match=r"full rectangles.*\(1, 2,"):
         DLS(**SMALL, select=True)(g, mask)
+    line = torch.zeros_like(mask)
+    line[..., 5, :] = True
+    with pytest.raises(ValueError, match="select=True finds no noise level"):
+        DLS(**SMALL, mu=0.5, select=True)(g, line)
     with pytest.raises(ValueError, match="shared"):
         DLS(**SMALL, select=True, learn="shared")
     with pytest.raises(ValueError, match="TotalVariation"):

@@ -20,10 +20,10 @@ import torch
 from torch import Tensor
 
 Threshold = Literal["hard", "soft", "firm"]
+THRESHOLDS: tuple[Threshold, ...] = ("hard", "soft", "firm")
+
 # Codes that are counted at once: PyTorch takes nine bytes of memory for each.
 _AT_ONCE = 2**20
-
-THRESHOLDS: tuple[Threshold, ...] = ("hard", "soft", "firm")
 
 
 def shrink(x: Tensor, mu: float | Tensor, bound: float = math.inf, rule: Threshold = "hard") -> Tensor:

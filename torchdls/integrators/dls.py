@@ -321,8 +321,10 @@ class DLS(Iterative[DLSResult]):
         try:
             return noise_level(fields.gradient, fields.mask, weight, fields.steps)
         except ValueError as error:
-            if isinstance(self.mu, str) or self.select:
+            if isinstance(self.mu, str):
                 raise ValueError(f"DLS: mu='auto' finds no noise level, give a number ({error})") from error
+            if self.select:
+                raise ValueError(f"DLS: select=True finds no noise level ({error})") from error
             return fields.gradient.new_full((len(fields.gradient),), math.nan)
 
     @property

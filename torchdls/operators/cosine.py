@@ -76,8 +76,7 @@ def from_half_spectrum(spectrum: Tensor, size: tuple[int, int]) -> Tensor:
     """Inverse of `half_spectrum`; overwrites its argument."""
     h, w = size
     spectrum.mul_(_rotation_back(h, w, like=spectrum.real))
-    # In two steps, since irfft2 copies its argument first; the scale is in the rotation.
-    return _restored(torch.fft.irfft2(spectrum, s=size, norm="forward"))
+    return _restored(torch.fft.irfft2(spectrum, s=size, norm="forward"))  # the rotation holds the scale
 
 
 def mirrored(spectrum: Tensor) -> Tensor:
