@@ -20,9 +20,9 @@ BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet $(addprefix --extra-index-url ,$(TORCH_INDEX)) $(TORCH)
 SCRATCH := build
 
-# Benchmarks are pytest files (bench_*.py) and scripts that take --smoke; a leading underscore marks a helper.
-BENCH_TESTS := $(wildcard benchmarks/bench_*.py benchmarks/test_*.py)
-BENCH_SCRIPTS := $(filter-out $(BENCH_TESTS) benchmarks/conftest.py benchmarks/_%,$(wildcard benchmarks/*.py))
+# Benchmarks are pytest files (bench_*.py) and scripts that take --smoke, run as modules; common/ holds their helpers.
+BENCH_TESTS := $(wildcard benchmarks/speed/bench_*.py)
+BENCH_SCRIPTS := $(filter-out $(BENCH_TESTS),$(wildcard benchmarks/speed/*.py benchmarks/quality/*.py))
 SMOKE_SIZES := not 512 and not 1024 and not 2048 and not 64-64
 NOTEBOOKS := $(patsubst notebooks/%.py,%,$(wildcard notebooks/*.py))
 
@@ -68,7 +68,8 @@ picture: demo
 
 bench-smoke: $(VENV)/.dev
 	$(if $(BENCH_TESTS),$(BIN)/python -m pytest --benchmark-disable --quiet -k "$(SMOKE_SIZES)" $(BENCH_TESTS))
-	@set -e; for script in $(BENCH_SCRIPTS); do echo "$$script --smoke"; $(BIN)/python $$script --smoke; done
+	@set -e; for module in $(subst /,.,$(BENCH_SCRIPTS:.py=)); do echo "$$module --smoke"; \
+	$(BIN)/python -m $$module --smoke; done
 
 check: test lint types notebooks bench-smoke
 

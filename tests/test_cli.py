@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from torchdls import LeastSquares, gradient_to_normals, io, normals_to_gradient, rmse
-from torchdls.cli import main
+from torchdls.cli.main import main
 from torchdls.surfaces import SURFACES
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -4,9 +4,9 @@ import pytest
 import torch
 from scipy.fft import dstn
 
-from torchdls.noise import _CUT, _TRIMMED_VARIANCE, noise_level
+from torchdls.noise import _CUT, _TRIMMED_VARIANCE, add_noise, noise_level, noise_sigma
 from torchdls.operators import GradientOperator, dct2, edge_slopes, idct2, neumann_eigenvalues
-from torchdls.surfaces import SURFACES, add_noise, noise_sigma, terrain
+from torchdls.surfaces import SURFACES, terrain
 
 
 def white(n, shape, seed=0, dtype=torch.float64):

@@ -42,5 +42,7 @@ def test_unknown_name():
 
 
 def test_names_are_listed_without_torch():
-    code = "import sys; from torchdls import cli; cli._parser().format_help(); sys.exit('torch' in sys.modules)"
+    code = (
+        "import sys; from torchdls.cli.main import _parser; _parser().format_help(); sys.exit('torch' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from torchdls.metrics import ssim
+from torchdls.noise import add_noise, noise_sigma
 from torchdls.operators import GradientOperator, dct2, edge_slopes, idct2, neumann_eigenvalues
-from torchdls.surfaces import SURFACES, add_noise, noise_sigma, tent, terrain, vase
+from torchdls.surfaces import SURFACES, tent, terrain, vase
 
 CREASED = {"tent", "vase", "pyramid", "cone", "ridge", "plateau"}
 SMOOTH = sorted(set(SURFACES) - CREASED)

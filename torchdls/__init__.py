@@ -60,7 +60,9 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.metrics import mean_angular_error as mean_angular_error
     from torchdls.metrics import rmse as rmse
     from torchdls.metrics import ssim as ssim
+    from torchdls.noise import add_noise as add_noise
     from torchdls.noise import noise_level as noise_level
+    from torchdls.noise import noise_sigma as noise_sigma
     from torchdls.operators import GradientOperator as GradientOperator
     from torchdls.operators import Patches as Patches
     from torchdls.operators import dct2 as dct2
@@ -84,8 +86,6 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.solvers import solve as solve
     from torchdls.surfaces import SURFACES as SURFACES
     from torchdls.surfaces import Surface as Surface
-    from torchdls.surfaces import add_noise as add_noise
-    from torchdls.surfaces import noise_sigma as noise_sigma
     from torchdls.surfaces import terrain as terrain
 
 __version__ = "0.1.0"
@@ -166,8 +166,8 @@ _MODULE_OF = {
     # data and measures
     "SURFACES": "surfaces",
     "Surface": "surfaces",
-    "add_noise": "surfaces",
-    "noise_sigma": "surfaces",
+    "add_noise": "noise",
+    "noise_sigma": "noise",
     "terrain": "surfaces",
     "made": "metrics",
     "mean_angular_error": "metrics",

@@ -2,7 +2,7 @@
 
 import sys
 
-from torchdls.cli import main
+from torchdls.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

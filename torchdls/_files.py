@@ -12,7 +12,9 @@ from types import ModuleType
 from typing import Any, BinaryIO
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 Array = NDArray[Any]
 SIGNATURES: dict[str, tuple[bytes, ...]] = {
@@ -124,3 +126,34 @@ def require(name: str, extra: str) -> ModuleType:
         return import_module(name)
     except ImportError as error:
         raise ImportError(f"{name} is not installed: pip install 'torchdls[{extra}]'") from error
+
+
+def one_of(path: Path, content: dict[str, Array], names: Sequence[str]) -> str:
+    for name in names:
+        if name in content:
+            return name
+    raise ValueError(f"{path}: holds {', '.join(content) or 'nothing'}, {' or '.join(names)} is needed")
+
+
+def pair(path: Path, value: Any) -> tuple[float, float]:
+    pair = np.asarray(value, np.float64).ravel()
+    if pair.size not in (1, 2) or not (np.isfinite(pair) & (pair > 0)).all():
+        raise ValueError(f"{path}: pixel_size {value!r}, one or two positive numbers are needed")
+    return float(pair[0]), float(pair[-1])
+
+
+def as_tensor(array: Array) -> Tensor:
+    """Bool, float32 or float64 in native byte order; half precision is widened."""
+    wanted = array.dtype if array.dtype.kind == "b" else np.float64 if array.dtype.itemsize >= 8 else np.float32
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=wanted))
+
+
+def as_array(value: Tensor | Array | float) -> Array:
+    return value.detach().cpu().numpy() if isinstance(value, Tensor) else np.asarray(value)
+
+
+def single_map(name: str, tensor: Tensor) -> Array:
+    array = as_array(tensor)
+    if array.ndim < 2 or array.size != np.prod(array.shape[-2:]) or not array.size:
+        raise ValueError(f"{name}: shape {tuple(array.shape)} given, one surface (1, 1, H, W) or (H, W) is needed")
+    return array.reshape(array.shape[-2:])

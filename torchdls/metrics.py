@@ -7,10 +7,15 @@ or a reference of batch size 1 serves the whole batch.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
 from torchdls.operators import as_pixel_size
+
+if TYPE_CHECKING:
+    pass
 
 _WINDOW = 11  # scikit-image's gaussian window: sigma 1.5 cut at 3.5 sigma
 
@@ -222,3 +227,29 @@ def _median(values: Tensor) -> Tensor:
 def _dilate(outside: Tensor) -> Tensor:
     """Centres of the windows, of those inside the image, that hold a pixel of `outside`."""
     return torch.nn.functional.max_pool2d(outside.float(), _WINDOW, stride=1) > 0
+
+
+def describe(
+    height: Tensor,
+    truth: Tensor,
+    *,
+    data_range: float | None = None,
+    gradient: Tensor | None = None,
+    mask: Tensor | None = None,
+    pixel_size: tuple[float, float] = (1.0, 1.0),
+) -> dict[str, float]:
+    """Figures of merit of one surface: `rmse` modulo the constant, `ssim` and `angle` (mean angular error, degrees).
+
+    Args:
+        height: (1, 1, H, W).
+        truth: (1, 1, H, W).
+        data_range: for the SSIM, which is left out without it.
+        gradient: true slopes (1, 2, H, W) for the angle; default: those of `truth`.
+        mask: (1, 1, H, W) bool.
+        pixel_size: (dx, dy).
+    """
+    measures = {"rmse": float(rmse(height, truth, mask))}
+    if data_range is not None:
+        measures["ssim"] = float(ssim(height, truth, data_range, mask))
+    angle = mean_angular_error(height, truth if gradient is None else gradient, mask, pixel_size)
+    return measures | {"angle": float(angle)}

@@ -7,14 +7,14 @@ import math
 import torch
 from torch import Tensor
 
-from torchdls._tape import bool_all
+from torchdls._statistics import NORMAL_MEDIAN
+from torchdls._tracing import bool_all
 from torchdls.operators import as_pixel_size, dst2, edge_slopes
 from torchdls.operators.cosine import cosine_matrix
 from torchdls.operators.sine import squared_sines
 from torchdls.operators.tables import table
 
 _CUT = 3.0  # samples beyond so many standard deviations belong to the surface (creases, waves), not to the noise
-_NORMAL_MEDIAN = 0.6744897501960817  # median magnitude of a standard normal variable
 _KEPT = math.erf(_CUT / math.sqrt(2))
 _TRIMMED_VARIANCE = 1 - _CUT * math.sqrt(2 / math.pi) * math.exp(-_CUT * _CUT / 2) / _KEPT  # of a cut standard normal
 
@@ -136,7 +136,7 @@ def _robust_scale(x: Tensor, valid: Tensor | None = None) -> Tensor:
     """
     magnitude = x.detach().abs()
     candidates = magnitude if valid is None else torch.where(valid, magnitude, torch.nan)
-    limit = _CUT * candidates.flatten(1).nanmedian(1).values / _NORMAL_MEDIAN
+    limit = _CUT * candidates.flatten(1).nanmedian(1).values / NORMAL_MEDIAN
     kept = candidates <= limit[:, None, None]
     norm = torch.linalg.vector_norm(torch.where(kept, x, 0), dim=(-2, -1))  # derivative 0, not NaN, at 0
     return norm / (_TRIMMED_VARIANCE * kept.sum((-2, -1), dtype=x.dtype)).sqrt()
@@ -291,3 +291,66 @@ def _projected_spectra(n: int, pixel_size: tuple[float, float]) -> tuple[Tensor,
     xx, yy = a_x * q, a_y * q
     xx[0, 0] = yy[0, 0] = 0.5
     return xx, yy, g_x * g_y.conj() * q
+
+
+def noise_sigma(gradient: Tensor, snr_db: float, mask: Tensor | None = None) -> Tensor:
+    """Standard deviation of the noise on one gradient sample at a signal-to-noise ratio.
+
+        SNR = 10 log10(||g||^2 / E||noise||^2),  E||noise||^2 = M sigma^2:  sigma = ||g|| 10^(-SNR/20) /
+        sqrt(M)
+
+    per surface, with ||g|| over both components and M samples (2 H W of them without a mask). The mean of g
+    is not removed. With this definition plain least squares reproduces the DCTLS column of the paper's
+    tables.
+
+    Args:
+        gradient: (N, 2, H, W), or (2, H, W).
+        snr_db: the ratio in decibels.
+        mask: (N, 1, H, W) bool, or (1, H, W): the pixels that count.
+
+    Returns:
+        (N,), or () for an unbatched gradient.
+
+    Raises:
+        ValueError: the gradient has no two components, the shapes differ, or `snr_db` is not finite.
+    """
+    if gradient.ndim not in (3, 4) or gradient.shape[-3] != 2:
+        raise ValueError(f"gradient: {tuple(gradient.shape)} given, (N, 2, H, W) or (2, H, W) is needed")
+    if not math.isfinite(snr_db):
+        raise ValueError(f"snr_db: {snr_db} given, a finite number of decibels is needed")
+    square = gradient.square()
+    if mask is None:
+        power = square.mean((-3, -2, -1))
+    else:
+        if mask.ndim != gradient.ndim or mask.shape[-2:] != gradient.shape[-2:]:
+            raise ValueError(f"mask {tuple(mask.shape)} does not fit the gradient {tuple(gradient.shape)}")
+        inside = mask.expand_as(gradient)
+        power = torch.where(inside, square, 0).sum((-3, -2, -1)) / inside.sum((-3, -2, -1))
+    return power.sqrt() * 10 ** (-snr_db / 20)
+
+
+def add_noise(
+    gradient: Tensor, snr_db: float, generator: torch.Generator | None = None, mask: Tensor | None = None
+) -> Tensor:
+    """Add white gaussian noise at a signal-to-noise ratio, independent in every sample and both components.
+
+    The standard deviation is `noise_sigma(gradient, snr_db, mask)`, which also defines the ratio. The noise
+    is drawn in float64 on the generator's device, so a seed means the same noise in float32 and float64.
+
+    Args:
+        gradient: (N, 2, H, W), or (2, H, W); not written to.
+        snr_db: the ratio in decibels.
+        generator: the source of randomness; None is PyTorch's default generator.
+        mask: (N, 1, H, W) bool, or (1, H, W): the pixels over which the ratio is taken. Noise is added
+            everywhere.
+
+    Returns:
+        The noisy gradient, in the shape and dtype of `gradient`.
+
+    Raises:
+        ValueError: as `noise_sigma`.
+    """
+    sigma = noise_sigma(gradient, snr_db, mask)
+    source = "cpu" if generator is None else generator.device
+    noise = torch.randn(gradient.shape, generator=generator, dtype=torch.float64, device=source)
+    return gradient + sigma[..., None, None, None] * noise.to(gradient)

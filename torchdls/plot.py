@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchdls._files import require
 from torchdls.geometry import gradient_to_normals
-from torchdls.metrics import mean_angular_error, rmse, ssim
+from torchdls.metrics import describe
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -52,32 +52,6 @@ def hillshade(
     a, e = math.radians(azimuth), math.radians(altitude)
     light = -zx * math.sin(a) * math.cos(e) + zy * math.cos(a) * math.cos(e) + math.sin(e)
     return (light / (1 + zx.square() + zy.square()).sqrt()).clamp(min=0)
-
-
-def describe(
-    height: Tensor,
-    truth: Tensor,
-    *,
-    data_range: float | None = None,
-    gradient: Tensor | None = None,
-    mask: Tensor | None = None,
-    pixel_size: tuple[float, float] = (1.0, 1.0),
-) -> dict[str, float]:
-    """Figures of merit of one surface: `rmse` modulo the constant, `ssim` and `angle` (mean angular error, degrees).
-
-    Args:
-        height: (1, 1, H, W).
-        truth: (1, 1, H, W).
-        data_range: for the SSIM, which is left out without it.
-        gradient: true slopes (1, 2, H, W) for the angle; default: those of `truth`.
-        mask: (1, 1, H, W) bool.
-        pixel_size: (dx, dy).
-    """
-    measures = {"rmse": float(rmse(height, truth, mask))}
-    if data_range is not None:
-        measures["ssim"] = float(ssim(height, truth, data_range, mask))
-    angle = mean_angular_error(height, truth if gradient is None else gradient, mask, pixel_size)
-    return measures | {"angle": float(angle)}
 
 
 def compare_heights(

@@ -284,69 +284,6 @@ def terrain(
     return Surface("terrain", height.to(device, dtype), gradient.to(device, dtype), span)
 
 
-def noise_sigma(gradient: Tensor, snr_db: float, mask: Tensor | None = None) -> Tensor:
-    """Standard deviation of the noise on one gradient sample at a signal-to-noise ratio.
-
-        SNR = 10 log10(||g||^2 / E||noise||^2),  E||noise||^2 = M sigma^2:  sigma = ||g|| 10^(-SNR/20) /
-        sqrt(M)
-
-    per surface, with ||g|| over both components and M samples (2 H W of them without a mask). The mean of g
-    is not removed. With this definition plain least squares reproduces the DCTLS column of the paper's
-    tables.
-
-    Args:
-        gradient: (N, 2, H, W), or (2, H, W).
-        snr_db: the ratio in decibels.
-        mask: (N, 1, H, W) bool, or (1, H, W): the pixels that count.
-
-    Returns:
-        (N,), or () for an unbatched gradient.
-
-    Raises:
-        ValueError: the gradient has no two components, the shapes differ, or `snr_db` is not finite.
-    """
-    if gradient.ndim not in (3, 4) or gradient.shape[-3] != 2:
-        raise ValueError(f"gradient: {tuple(gradient.shape)} given, (N, 2, H, W) or (2, H, W) is needed")
-    if not math.isfinite(snr_db):
-        raise ValueError(f"snr_db: {snr_db} given, a finite number of decibels is needed")
-    square = gradient.square()
-    if mask is None:
-        power = square.mean((-3, -2, -1))
-    else:
-        if mask.ndim != gradient.ndim or mask.shape[-2:] != gradient.shape[-2:]:
-            raise ValueError(f"mask {tuple(mask.shape)} does not fit the gradient {tuple(gradient.shape)}")
-        inside = mask.expand_as(gradient)
-        power = torch.where(inside, square, 0).sum((-3, -2, -1)) / inside.sum((-3, -2, -1))
-    return power.sqrt() * 10 ** (-snr_db / 20)
-
-
-def add_noise(
-    gradient: Tensor, snr_db: float, generator: torch.Generator | None = None, mask: Tensor | None = None
-) -> Tensor:
-    """Add white gaussian noise at a signal-to-noise ratio, independent in every sample and both components.
-
-    The standard deviation is `noise_sigma(gradient, snr_db, mask)`, which also defines the ratio. The noise
-    is drawn in float64 on the generator's device, so a seed means the same noise in float32 and float64.
-
-    Args:
-        gradient: (N, 2, H, W), or (2, H, W); not written to.
-        snr_db: the ratio in decibels.
-        generator: the source of randomness; None is PyTorch's default generator.
-        mask: (N, 1, H, W) bool, or (1, H, W): the pixels over which the ratio is taken. Noise is added
-            everywhere.
-
-    Returns:
-        The noisy gradient, in the shape and dtype of `gradient`.
-
-    Raises:
-        ValueError: as `noise_sigma`.
-    """
-    sigma = noise_sigma(gradient, snr_db, mask)
-    source = "cpu" if generator is None else generator.device
-    noise = torch.randn(gradient.shape, generator=generator, dtype=torch.float64, device=source)
-    return gradient + sigma[..., None, None, None] * noise.to(gradient)
-
-
 def _check_size(n: Size) -> tuple[int, int]:
     pair = (n, n) if isinstance(n, int) else n
     if not isinstance(pair, tuple | list) or len(pair) != 2 or not all(isinstance(k, int) for k in pair):

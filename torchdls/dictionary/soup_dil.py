@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchdls._tape import recorded
+from torchdls._tracing import recorded
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold, shrink
 
 Order = Literal["atom", "block"]

@@ -2,12 +2,16 @@
 
 from torchdls._registry import INTEGRATORS
 from torchdls.integrators.base import Fields, Integrator
-from torchdls.integrators.dls import DLS, DLSResult
-from torchdls.integrators.dls_objective import dls_objective
-from torchdls.integrators.fourier import FrankotChellappa
-from torchdls.integrators.horn_brooks import HornBrooks
-from torchdls.integrators.least_squares import LeastSquares
-from torchdls.integrators.line_integral import LineIntegral
+from torchdls.integrators.classic import (
+    FrankotChellappa,
+    HarkerOLeary,
+    HornBrooks,
+    LeastSquares,
+    LineIntegral,
+    SpectralRegularization,
+    TikhonovRegularization,
+)
+from torchdls.integrators.dls import DLS, DLSResult, dls_objective
 from torchdls.integrators.robust import (
     L1,
     AnisotropicDiffusion,
@@ -19,7 +23,6 @@ from torchdls.integrators.robust import (
     WeightedLeastSquares,
 )
 from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
-from torchdls.integrators.sylvester import HarkerOLeary, SpectralRegularization, TikhonovRegularization
 
 __all__ = [
     "AnisotropicDiffusion",

@@ -7,9 +7,10 @@ from math import sqrt
 
 from torch import Tensor, nn
 
+from torchdls.integrators.data_term import edge_cost
 from torchdls.integrators.fields import Fields as Fields
 from torchdls.integrators.fields import check_accepted, check_gradient, check_values, fit_fields, within_mask
-from torchdls.operators import GradientOperator, as_pixel_size, edge_slopes
+from torchdls.operators import as_pixel_size, edge_slopes
 
 
 class Integrator(nn.Module):
@@ -106,9 +107,3 @@ class Integrator(nn.Module):
             anchor_weight=None if fields.anchor_weight is None else fields.anchor_weight * h**2,
             steps=(self.pixel_size[0] / h, self.pixel_size[1] / h),
         )
-
-
-def edge_cost(z: Tensor, v: Tensor, w: Tensor | None, steps: tuple[float, float]) -> Tensor:
-    """(N,) 1/2 sum w (A z - v)^2."""
-    misfit = (GradientOperator("forward", steps)(z) - v).square()
-    return 0.5 * (misfit if w is None else w * misfit).sum((-3, -2, -1))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchdls._tape import bool_all, visible
+from torchdls._tracing import bool_all, visible
 
 
 class Fields(NamedTuple):

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdls._tape import recorded
+from torchdls._tracing import recorded
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._statistics import NORMAL_MEDIAN
+
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # the entries of a symmetric 3 x 3 matrix that are kept
 _RANK = 1e-6  # a pivot below this part of its diagonal means that the lights do not span the space
 _FACING = 1e-2  # smallest cosine to the viewer of a normal that has slopes, as in `normals_to_gradient`
-_NORMAL_MEDIAN = 0.6744897501960817  # median magnitude of a standard normal variable
 
 
 class PhotometricResult(NamedTuple):
@@ -176,7 +177,7 @@ def _scale(residual: Tensor, images: Tensor, known: Tensor) -> Tensor:
     """(N, 1, 1, 1) robust deviation of the residuals, at least a thousandth of the rms of the images; 1 if all is 0."""
     count = known.sum((-3, -2, -1)).clamp(min=1)
     magnitude = torch.where(known, residual.abs(), torch.nan).flatten(1)
-    scale = magnitude.nanmedian(1).values.nan_to_num(0.0) / _NORMAL_MEDIAN
+    scale = magnitude.nanmedian(1).values.nan_to_num(0.0) / NORMAL_MEDIAN
     power = torch.where(known, images.square(), 0).sum((-3, -2, -1)) / count
     least = torch.where(power > 0, 1e-3 * torch.where(power > 0, power, 1).sqrt(), 1)
     return torch.maximum(scale, least)[:, None, None, None]

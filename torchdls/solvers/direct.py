@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdls._tape import recorded, visible
+from torchdls._tracing import recorded, visible
 from torchdls.operators import dct2, idct2, neumann_eigenvalues, slope_divergence
 from torchdls.operators.cosine import MATRIX_LIMIT, from_half_spectrum, half_spectrum, mirrored
 from torchdls.operators.tables import table

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchdls.integrators.base import Fields
+from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.operators import edge_slopes
 from torchdls.solvers import solve
@@ -31,19 +32,6 @@ class RobustResult(NamedTuple):
     objective: Tensor
     iterations: Tensor
     converged: Tensor
-
-
-class DataTerm(Protocol):
-    """A data term bound to its fields, as a function of the height."""
-
-    def cost(self, z: Tensor) -> Tensor:
-        """(N,) its value at z."""
-
-    def majoriser(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Slopes v and trusts w (N, 2, H, W) of a quadratic that touches the data term at z and is nowhere below it.
-
-        The quadratic is 1/2 sum w (A . - v)^2, but for a constant.
-        """
 
 
 class Robust(Iterative[RobustResult]):

@@ -8,10 +8,11 @@ from typing import Literal, NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchdls._tape import bool_all
+from torchdls._tracing import bool_all
 from torchdls.integrators.base import Fields
-from torchdls.integrators.robust.base import DataTerm, Robust, State
-from torchdls.integrators.robust.terms import Terms, sample_noise
+from torchdls.integrators.data_term import DataTerm
+from torchdls.integrators.robust.base import Robust, State
+from torchdls.integrators.robust.residuals import Terms, sample_noise
 
 _RELAX = 1.8  # over-relaxation of ADMM
 _HUBER = 1.345  # in units of the noise: 95 % as precise as least squares where the noise is normal

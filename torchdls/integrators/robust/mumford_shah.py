@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from torchdls.integrators.base import Fields
-from torchdls.integrators.robust.base import DataTerm, Robust, State
+from torchdls.integrators.data_term import DataTerm
+from torchdls.integrators.robust.base import Robust, State
 from torchdls.integrators.robust.convex import level, positive_or_auto
-from torchdls.integrators.robust.reweighted import huber_start
-from torchdls.integrators.robust.terms import Terms
+from torchdls.integrators.robust.m_estimator import huber_start
+from torchdls.integrators.robust.residuals import Terms
 from torchdls.operators import GradientOperator, edge_slopes
 from torchdls.solvers import solve
 

@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls.integrators.base import Fields
-from torchdls.integrators.least_squares import LeastSquares
-from torchdls.integrators.robust.terms import curl_of, least_slope, masked_median, present
+from torchdls.integrators.classic.least_squares import LeastSquares
+from torchdls.integrators.robust.residuals import curl_of, least_slope, present
 from torchdls.operators import edge_slopes
 from torchdls.solvers import SolveResult, solve
-
-_NORMAL_MEDIAN = 0.6744897501960817  # median magnitude of a standard normal variable
 
 
 class WeightedLeastSquares(LeastSquares):
@@ -73,7 +72,7 @@ class WeightedLeastSquares(LeastSquares):
     def _trust(self, fields: Fields, w: Tensor) -> Tensor:
         """(N, 2, H, W), q."""
         curl, cells = curl_of(fields)
-        noise = masked_median(curl.abs().flatten(1), cells.flatten(1)) / _NORMAL_MEDIAN
+        noise = masked_median(curl.abs().flatten(1), cells.flatten(1)) / NORMAL_MEDIAN
         kappa = self.threshold * torch.maximum(noise, least_slope(fields.gradient, w > 0))
         badness = torch.where(cells, (curl / kappa[:, None, None]).square(), 0)
         number = _beside(cells.to(curl.dtype)).clamp(min=1)

@@ -1,0 +1,202 @@
+"""What DLS reads from its data and settings: the noise, the initial dictionary; and what it refuses."""
+
+import pytest
+import torch
+from torch import nn
+
+from tests.helpers import assert_unchanged, random_field, seeded
+from tests.integrators.dls.test_dls import SMALL, H, W, field
+from torchdls import (
+    DLS,
+    SURFACES,
+    Integrator,
+    LeastSquares,
+    TotalVariation,
+    add_noise,
+    dct_dictionary,
+    noise_level,
+    rmse,
+)
+
+
+def test_noise_is_that_of_the_surface_on_oblong_pixels():
+    """With dx far from dy the curl of a surface vanishes only if the spacings count."""
+    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(40.0), indexing="ij")
+    phase = x * 0.5 / 6 + y * 2.0 / 6
+    g = torch.stack([torch.cos(phase), torch.cos(phase)])[None] + 0.05 * random_field(1, 2, 40, 40, dtype=torch.float32)
+    noise = DLS(n_iter=0, pixel_size=(0.5, 2.0)).solve(g).noise
+    torch.testing.assert_close(noise, noise_level(g, pixel_size=(0.5, 2.0)))
+    assert abs(float(noise) - 0.05) < 0.01
+
+
+def test_noise_knows_the_weights():
+    """Samples of weight 0 are no evidence, and a common factor of all weights is none either."""
+    g = field(1, h=40, w=40)
+    weight = torch.ones(1, 1, 40, 40, dtype=g.dtype)
+    weight[..., 10:14, 10:30] = 0
+    spoilt = torch.where(weight == 0, 1e3, g)
+    options = {**SMALL, "n_iter": 0}
+    clean = DLS(**options).solve(g, weight=weight).noise
+    torch.testing.assert_close(DLS(**options).solve(spoilt, weight=weight).noise, clean)
+    torch.testing.assert_close(DLS(**options).solve(g, weight=7 * weight).noise, clean)
+    assert abs(float(clean) - 0.3) < 0.05
+
+
+def test_a_mask_without_complete_cells_needs_a_threshold():
+    """There is no closed loop to read the noise from; a number mu does without."""
+    line = torch.zeros(1, 1, H, W, dtype=torch.bool)
+    line[..., 5, :] = True
+    z = DLS(**SMALL, mu=0.5).solve(field(), line)
+    assert z.height.isfinite().all()
+    assert z.noise.isnan().all()
+    with pytest.raises(ValueError, match="mu='auto' finds no noise level, give a number"):
+        DLS(**SMALL)(field(), line)
+
+
+def test_initial_dictionary_is_normalised_kept_or_trained():
+    g, atoms = field(2), random_field(16, 20)
+    with assert_unchanged(atoms):
+        dls = DLS(**SMALL, mu=0.5, dictionary=atoms, learn="fixed")
+        result = dls.solve(g)
+    torch.testing.assert_close(result.dictionary[0], atoms / atoms.norm(dim=0))
+    assert not list(dls.parameters())
+    assert set(dls.state_dict()) == {"dictionary"}
+    scaled = DLS(**SMALL, mu=0.5, dictionary=3 * atoms, learn="fixed")(g)
+    torch.testing.assert_close(scaled, result.height)
+    trained = DLS(**SMALL, mu=0.5, dictionary=nn.Parameter(atoms), learn="fixed", grad="unroll")
+    trained(g).square().sum().backward()
+    assert trained.dictionary.grad.isfinite().all()
+    assert trained.dictionary.grad.abs().max() > 0
+
+
+def test_one_dictionary_for_each_surface():
+    g, atoms = field(2), torch.stack([dct_dictionary(4), random_field(16, 16, dtype=torch.float32)])
+    both = DLS(**SMALL, mu=0.5, dictionary=atoms)(g)
+    for i in range(2):
+        torch.testing.assert_close(both[i : i + 1], DLS(**SMALL, mu=0.5, dictionary=atoms[i])(g[i : i + 1]))
+
+
+def test_shared_dictionary_of_one_surface_is_its_own():
+    g = field(1)
+    torch.testing.assert_close(DLS(**SMALL, learn="shared")(g), DLS(**SMALL, learn="each")(g), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"patch_size": 0}, "size: 0 given"),
+        ({"patch_size": 4, "stride": 5}, "stride: .* uncovered"),
+        ({"n_atoms": 0}, "n_atoms: 0 given"),
+        ({"lam": -1.0}, "lam=-1.0"),
+        ({"lam": float("nan")}, "lam=nan"),
+        ({"lam": float("inf")}, "lam=inf"),
+        ({"lam": "much"}, "lam='much'"),
+        ({"lam": None}, "lam is a NoneType"),
+        ({"lam": torch.tensor([1.0, -1.0])}, "lam"),
+        ({"mu": -0.1}, "mu=-0.1"),
+        ({"mu": float("nan")}, "mu=nan"),
+        ({"mu": "none"}, "mu='none'"),
+        ({"n_iter": -1}, "n_iter=-1"),
+        ({"n_iter": 2.5}, "n_iter=2.5"),
+        ({"n_sweeps": 0}, "n_sweeps=0"),
+        ({"n_prox": 0}, "n_prox=0"),
+        ({"z_step": "fast"}, "z_step='fast' is unknown; choose from 'exact', 'proximal'"),
+        ({"order": "row"}, "order='row'"),
+        ({"learn": "none"}, "learn='none'"),
+        ({"unused": "last"}, "unused='last'"),
+        ({"bound": 0.0}, "bound=0.0"),
+        ({"tol": -1e-3}, "tol=-0.001"),
+        ({"z_tol": 0.0}, "z_tol=0.0"),
+        ({"data_term": "tv"}, "data_term is a str"),
+        ({"data_term": Integrator()}, "data_term Integrator is not built on the weighted solve"),
+        ({"dictionary": [[1.0]]}, "dictionary is a list"),
+        ({"dictionary": torch.ones(16, 4)}, r"dictionary \(16, 4\) given, .* n = 64"),
+        ({"dictionary": torch.ones(64)}, r"dictionary \(64,\)"),
+        ({"dictionary": torch.zeros(64, 4)}, "atom that is zero or not finite"),
+        ({"dictionary": torch.full((64, 4), torch.nan)}, "atom that is zero or not finite"),
+        ({"pixel_size": 0}, "pixel_size: 0 given"),
+    ],
+    ids=str,
+)
+def test_bad_settings_are_named(options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        DLS(**options)
+
+
+@pytest.mark.parametrize(
+    "options, shape, message",
+    [
+        ({}, (1, 2, 7, 20), r"DLS: gradient \(1, 2, 7, 20\).* smaller than a patch of 8 x 8"),
+        ({"lam": torch.ones(3)}, (2, 2, 16, 16), r"lam \(3,\) does not fit 2 surfaces"),
+        ({"mu": torch.ones(3)}, (2, 2, 16, 16), r"mu \(3,\) does not fit 2 surfaces"),
+        ({"dictionary": torch.rand(3, 64, 4)}, (2, 2, 16, 16), r"dictionary \(3, 64, 4\) does not fit 2 surfaces"),
+        ({"dictionary": torch.rand(2, 64, 4), "learn": "shared"}, (2, 2, 16, 16), "learn='shared'"),
+    ],
+)
+def test_fields_that_do_not_fit_the_settings_are_named(options, shape, message):
+    with pytest.raises(ValueError, match=message):
+        DLS(**options)(torch.zeros(shape))
+
+
+def selected(surface, snr, **options):
+    surface = SURFACES[surface](48, dtype=torch.float64)
+    gradient = add_noise(surface.gradient, snr, seeded(2))
+    return surface, gradient, DLS(select=True, n_iter=8, tol=0, z_tol=1e-11, **options).solve(gradient)
+
+
+def test_select_takes_the_threshold_of_the_smaller_error():
+    """On a strongly noisy Tent it raises the threshold, and gains by it."""
+    surface, gradient, found = selected("tent", 1)
+    assert found.mu > 1.2 * found.noise
+    assert found.lam == 0.5
+    plain, default = LeastSquares()(gradient), DLS(n_iter=8, tol=0)(gradient)
+    errors = [float(rmse(z, surface.height)) for z in (found.height, default, plain)]
+    assert errors == sorted(errors)
+    torch.testing.assert_close(DLS(lam=0.5, mu=found.mu, n_iter=8, tol=0, z_tol=1e-11)(gradient), found.height)
+
+
+def test_select_keeps_least_squares_where_nothing_is_to_gain_each_surface_for_itself():
+    _, tent, first = selected("tent", 1)
+    _, fractal, second = selected("fractal", 40)
+    assert second.lam == 0
+    torch.testing.assert_close(second.height, LeastSquares()(fractal), rtol=0, atol=1e-7)
+    both = DLS(select=True, n_iter=8, tol=0, z_tol=1e-11).solve(torch.cat([tent, fractal]))
+    torch.testing.assert_close(both.height, torch.cat([first.height, second.height]), rtol=0, atol=1e-7)
+    assert both.lam.tolist() == [0.5, 0]
+
+
+def test_select_sets_a_given_threshold_against_least_squares():
+    _, _, harmful = selected("tent", 30, mu=5.0)
+    assert harmful.lam == 0
+    _, _, useful = selected("tent", 1, mu=1.5)
+    assert useful.mu == 1.5
+    assert useful.lam == 0.5
+
+
+def test_the_choice_is_held_fixed_in_the_derivative():
+    _, gradient, found = selected("tent", 1)
+    chosen = DLS(lam=0.5, mu=found.mu, n_iter=8, tol=0, z_tol=1e-11)
+    slopes = []
+    for model in (DLS(select=True, n_iter=8, tol=0, z_tol=1e-11), chosen):
+        point = gradient.clone().requires_grad_()
+        model(point).square().sum().backward()
+        slopes.append(point.grad)
+    assert slopes[0].abs().max() > 0
+    torch.testing.assert_close(*slopes)
+
+
+def test_select_refuses_what_it_cannot_predict():
+    g = field()
+    mask = torch.ones(1, 1, H, W, dtype=torch.bool)
+    DLS(**SMALL, select=True)(g, mask)
+    mask[..., 3, 3] = False
+    with pytest.raises(ValueError, match=r"full rectangles.*\(1, 2,"):
+        DLS(**SMALL, select=True)(g, mask)
+    line = torch.zeros_like(mask)
+    line[..., 5, :] = True
+    with pytest.raises(ValueError, match="select=True finds no noise level"):
+        DLS(**SMALL, mu=0.5, select=True)(g, line)
+    with pytest.raises(ValueError, match="shared"):
+        DLS(**SMALL, select=True, learn="shared")
+    with pytest.raises(ValueError, match="TotalVariation"):
+        DLS(**SMALL, select=True, data_term=TotalVariation())

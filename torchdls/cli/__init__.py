@@ -1,0 +1,5 @@
+"""The command line `torchdls`."""
+
+from torchdls.cli.main import main
+
+__all__ = ["main"]

@@ -1,0 +1,79 @@
+"""The command line: `torchdls demo`, `torchdls integrate`, `torchdls methods`.
+
+PyTorch is imported when a command runs, so `torchdls --help` answers at once. Whatever is wrong with a file or an
+argument is one line on standard error and exit status 2; output files are written whole or not at all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from torchdls import __version__
+from torchdls.cli.demo import add_demo
+from torchdls.cli.integrate import add_integrate
+from torchdls.cli.methods import list_methods
+
+if TYPE_CHECKING:
+    pass
+
+
+_EXAMPLES = """\
+examples:
+  torchdls demo --out demo
+  torchdls integrate normals.png --convention directx --mask mask.png -o surface.ply -o height.tiff
+  torchdls integrate gradient.npz --method least_squares -o height.npz
+  torchdls integrate normals.png --convention opencv --camera K.txt -o depth.tiff
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status: 0, 2 for bad input, 130 when interrupted."""
+    arguments = _parser().parse_args(argv)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            arguments.run(arguments)
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        return _complain(error)
+    except KeyboardInterrupt:
+        print("torchdls: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _warn(message: Warning | str, *where: object, **more: object) -> None:
+    """A warning of the library as one line, without the place in the code."""
+    print(f"torchdls: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+def _complain(error: Exception) -> int:
+    if isinstance(error, BrokenPipeError):  # the reader of our output went away, as in `torchdls methods | head -1`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    if isinstance(error, OSError) and error.filename is not None:
+        message = f"{error.filename}: {error.strerror}"
+    else:
+        message = " ".join(str(error).split()) or type(error).__name__
+    print(f"torchdls: error: {message}", file=sys.stderr)
+    return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="torchdls",
+        description="Surfaces from noisy gradients and normal maps, by dictionary learning (DLS) and its peers.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"torchdls {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    add_integrate(commands)
+    add_demo(commands)
+    methods = commands.add_parser("methods", help="list the methods", description="List the methods and their options.")
+    methods.set_defaults(run=list_methods)
+    return parser

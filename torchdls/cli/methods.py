@@ -1,0 +1,78 @@
+"""`torchdls methods`, and how a command builds and runs one."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import inspect
+import sys
+import textwrap
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from torchdls._registry import INTEGRATORS
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchdls.integrators import Integrator
+
+
+def list_methods(arguments: argparse.Namespace) -> None:
+    """Print the integrators with their options."""
+    indent = " " * (max(map(len, INTEGRATORS)) + 2)
+    for name in INTEGRATORS:
+        print(f"{name:<{len(indent)}}{INTEGRATORS.summary(name)}")
+        options = ", ".join(f"{option}={default!r}" for option, default in INTEGRATORS.parameters(name).items())
+        print(textwrap.fill(options, 110, initial_indent=indent, subsequent_indent=indent))
+
+
+def build_method(name: str, pixel_size: tuple[float, float], settings: Sequence[str] = ()) -> Integrator:
+    """The integrator of that name, with options given as words `name=value`."""
+    if name not in INTEGRATORS:
+        raise ValueError(f"--method: {name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
+    options: dict[str, Any] = {"pixel_size": pixel_size}
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        if not equals or not key.isidentifier():
+            raise ValueError(f"--set: {setting!r} given, NAME=VALUE is needed")
+        try:
+            options[key] = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            options[key] = value  # a plain word such as z_step=proximal
+    return INTEGRATORS[name](**options)
+
+
+@contextmanager
+def _bar(label: str, method: Integrator, quiet: bool) -> Iterator[Any]:
+    """A callback that moves a progress bar, or None for methods without iterations to show."""
+    steps = getattr(method, "n_iter", None)
+    if quiet or not steps or not hasattr(method, "solve") or not sys.stderr.isatty():
+        yield None
+        return
+    from torchdls._files import require
+
+    tqdm = require("tqdm", "plots")
+    form = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}"
+    with tqdm.tqdm(total=steps, desc=label, leave=False, bar_format=form) as bar:
+
+        def step(iteration: int, objective: Tensor) -> None:
+            bar.set_postfix_str(f"objective {float(objective.sum()):.6g}", refresh=False)
+            bar.update(iteration - bar.n)
+            if iteration == steps:
+                bar.refresh()  # the last step shows, however quick
+
+        yield step
+
+
+def run_method(
+    label: str, method: Integrator, quiet: bool, gradient: Tensor, **fields: Tensor | None
+) -> tuple[Tensor, Tensor | None]:
+    """The height, and the noise level if the method found one."""
+    solve: Any = getattr(method, "solve", None)
+    if solve is None or "callback" not in inspect.signature(solve).parameters:
+        return method(gradient, **fields), None
+    with _bar(label, method, quiet) as step:
+        result = solve(gradient, **fields, callback=step)
+    return result.height, getattr(result, "noise", None)

@@ -1,0 +1,35 @@
+"""Normals, gradients, conventions and cameras: what comes in from other tools, and goes back to them."""
+
+from torchdls.geometry.cameras import depth_to_points, height_to_points, log_depth_to_depth
+from torchdls.geometry.conventions import (
+    GRADIENT_CONVENTIONS,
+    NORMAL_CONVENTIONS,
+    convert_gradient,
+    convert_normals,
+)
+from torchdls.geometry.normals import (
+    ConventionGuess,
+    GradientField,
+    GradientToNormals,
+    NormalsToGradient,
+    gradient_to_normals,
+    guess_convention,
+    normals_to_gradient,
+)
+
+__all__ = [
+    "ConventionGuess",
+    "GRADIENT_CONVENTIONS",
+    "GradientField",
+    "GradientToNormals",
+    "NORMAL_CONVENTIONS",
+    "NormalsToGradient",
+    "convert_gradient",
+    "convert_normals",
+    "depth_to_points",
+    "gradient_to_normals",
+    "guess_convention",
+    "height_to_points",
+    "log_depth_to_depth",
+    "normals_to_gradient",
+]

@@ -1,0 +1,267 @@
+r"""Normals, gradients, conventions and cameras: everything is converted here, once, at the door.
+
+**Frame.** Canonical normals have x to the right, y up and z toward the viewer (OpenGL). Canonical gradients follow the
+rows and columns of the image: `gradient[:, 0] = dz/dx` to the right, `gradient[:, 1] = dz/dy` down; z grows toward
+the viewer. The tangents (1, 0, z_x) and (0, -1, z_y) are orthogonal to the normal, hence
+
+    z_x = -n1/n3,    z_y = +n2/n3,        n = (-z_x, z_y, 1) / sqrt(1 + z_x^2 + z_y^2).
+
+| normals     | frame of the source                              | to canonical    |
+|-------------|--------------------------------------------------|-----------------|
+| `"opengl"`  | x right, y up, z to the viewer (also glTF, Blender, DiLiGenT) | none |
+| `"directx"` | x right, y down, z to the viewer (green channel inverted) | (n1, -n2, n3) |
+| `"opencv"`  | x right, y down, z forward, normals to the camera (n3 < 0) | (n1, -n2, -n3) |
+| `"kornia"`  | the same frame, normals away from the camera (n3 > 0) | (-n1, n2, n3) |
+| `"matlab"`  | x down the rows, y along the columns, z to the viewer | (n2, -n1, n3) |
+
+| gradients     | components                                     | to canonical |
+|---------------|------------------------------------------------|--------------|
+| `"image"`     | height: to the right, down                     | none         |
+| `"cartesian"` | height: to the right, up                       | (p, -q)      |
+| `"depth"`     | depth (distance, grows away): to the right, down | (-p, -q)   |
+| `"matlab"`    | height: down the rows, along the columns       | (q, p)       |
+
+**Perspective camera.** With intrinsics K and homogeneous pixel m = (column, row, 1), the surface point is
+X = Z K^-1 m. A tangent plane n.X = d reads l.m = d/Z in the image, with the covector l = K^-T n. Differentiating,
+
+    grad log Z = -(l1, l2) / (l.m),        l = (-u_x, -u_y, 1 + u_x column + u_y row)   for u = log Z,
+
+so the logarithm of the depth is integrated like a height, and its free constant is the free scale of the scene
+(Durou and Courteille 2007; Queau, Durou and Aujol 2018). Integrators never hear of cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchdls.geometry.cameras import apply_matrix, check_camera, inverse_camera, pixel_grid
+from torchdls.geometry.conventions import NORMAL_CONVENTIONS, check_field, check_mask, inverse_axes, lookup, permute
+from torchdls.operators import as_pixel_size
+
+
+class GradientField(NamedTuple):
+    """Gradients from normals, and where they can be trusted.
+
+    Attributes:
+        gradient: (N, 2, H, W); 0 at invalid pixels.
+        mask: (N, 1, H, W) bool; True where the pixel lies in the caller's mask and its normal is valid.
+        invalid: (N,) number of pixels inside the caller's mask whose normal is invalid.
+    """
+
+    gradient: Tensor
+    mask: Tensor
+    invalid: Tensor
+
+
+class ConventionGuess(NamedTuple):
+    """The most integrable reading of a normal map.
+
+    Attributes:
+        convention: the candidate with the smallest residual.
+        residual: for each candidate its non-integrable part, from 0 (a surface) to 1 (no surface).
+    """
+
+    convention: str
+    residual: dict[str, float]
+
+
+def normals_to_gradient(
+    normals: Tensor,
+    convention: str = "opengl",
+    *,
+    mask: Tensor | None = None,
+    camera: Tensor | None = None,
+    pixel_size: float | Sequence[float] = 1.0,
+    eps: float = 1e-2,
+) -> GradientField:
+    r"""Gradient of the surface whose normals are given.
+
+        orthographic:  z_x = -dx n1/n3,  z_y = +dy n2/n3       perspective:  grad log Z = -(l1, l2)/(l.m),  l = K^-T n
+
+    Only the direction of a normal counts. A pixel is invalid when its normal is zero, not finite, or at grazing angle
+    (the cosine to the viewing direction is at most `eps`); it gets slope 0, mask False, and derivatives that are
+    exactly 0. Differentiable in `normals` and `camera`.
+
+    Args:
+        normals: (N, 3, H, W) or (3, H, W), of any length.
+        convention: a key of `NORMAL_CONVENTIONS` (table at the top of this module).
+        mask: (N, 1, H, W) bool; pixels outside are not counted as invalid. Default: all pixels.
+        camera: intrinsics K, (3, 3) or (N, 3, 3), in pixels, with integer coordinates at pixel centres and the first
+            pixel at (0, 0). The result is then the gradient of log depth per pixel; see `log_depth_to_depth`.
+        pixel_size: spacing (dx, dy) of the pixels. Leave it at 1 when the integrator is given the pixel size: the
+            result is then the slope, without unit. Otherwise the result is the rise per pixel.
+        eps: smallest cosine that counts as visible; 0.01 is 89.4 degrees, about one step of an 8-bit normal map.
+
+    Returns:
+        `GradientField(gradient, mask, invalid)`; unbatched input comes back unbatched.
+
+    Raises:
+        TypeError: a tensor has the wrong type.
+        ValueError: a shape, the convention, the camera, `pixel_size` or `eps` is not usable, or a camera comes with
+            a pixel size.
+    """
+    check_field("normals", normals, 3)
+    axes = lookup(NORMAL_CONVENTIONS, "convention", convention)
+    check_mask(mask, normals)
+    if not 0 <= eps < 1:
+        raise ValueError(f"eps: {eps!r} given, a cosine from 0 to below 1 is needed")
+    dx, dy = _pixel_size(pixel_size, camera)
+    n = permute(normals, axes)
+    finite = n.isfinite().all(-3, keepdim=True)
+    n = torch.where(finite, n, 0)
+    if camera is None:
+        a, b, c = n.split(1, -3)
+        numerators, length = torch.cat([-dx * a, dy * b], -3), _length(a, b, c)
+    else:
+        k_inv = inverse_camera(camera, normals)
+        covector = apply_matrix(k_inv.mT, permute(n, inverse_axes(NORMAL_CONVENTIONS["opencv"])))
+        pixel = pixel_grid(n)
+        ray = apply_matrix(k_inv, pixel)
+        numerators = covector[..., :2, :, :]
+        c = -(covector * pixel).sum(-3, keepdim=True)
+        length = _length(*n.split(1, -3)) * _length(*ray.split(1, -3))
+    visible = finite & (c > eps * length.detach())
+    inside = visible if mask is None else visible & mask
+    # The safe denominator comes before the division: masking afterwards would multiply inf by 0 in the backward pass.
+    gradient = torch.where(inside, numerators, 0) / torch.where(inside, c, 1)
+    blind = ~visible if mask is None else ~visible & mask
+    return GradientField(gradient, inside, blind.sum((-3, -2, -1)))
+
+
+def gradient_to_normals(
+    gradient: Tensor,
+    convention: str = "opengl",
+    *,
+    camera: Tensor | None = None,
+    pixel_size: float | Sequence[float] = 1.0,
+) -> Tensor:
+    r"""Unit normals of the surface with the given gradient; the inverse of `normals_to_gradient` at valid pixels.
+
+        orthographic:  n ~ (-z_x/dx, z_y/dy, 1)            perspective:  n ~ -K^T (-u_x, -u_y, 1 + u_x column + u_y row)
+
+    Args:
+        gradient: (N, 2, H, W) or (2, H, W); of log depth when a camera is given.
+        convention: the convention of the normals that are returned.
+        camera: intrinsics K, (3, 3) or (N, 3, 3), as in `normals_to_gradient`.
+        pixel_size: spacing (dx, dy) if the gradient is the rise per pixel; 1 if it is a slope without unit.
+
+    Returns:
+        (N, 3, H, W), of length 1; NaN where the gradient is NaN. Raises as `normals_to_gradient` does.
+    """
+    check_field("gradient", gradient, 2)
+    axes = lookup(NORMAL_CONVENTIONS, "convention", convention)
+    dx, dy = _pixel_size(pixel_size, camera)
+    gx, gy = gradient.split(1, -3)
+    if camera is None:
+        n = torch.cat([gx / -dx, gy / dy, torch.ones_like(gx)], -3)
+    else:
+        columns, rows, one = pixel_grid(gradient).split(1, -3)
+        covector = torch.cat([-gx, -gy, one + gx * columns + gy * rows], -3)
+        k = check_camera(camera, gradient)
+        n = permute(-apply_matrix(k.mT, covector), NORMAL_CONVENTIONS["opencv"])
+    return permute(n / torch.linalg.vector_norm(n, dim=-3, keepdim=True), inverse_axes(axes))
+
+
+class _Conversion(nn.Module):
+    camera: Tensor | None
+
+    def __init__(
+        self, convention: str = "opengl", *, camera: Tensor | None = None, pixel_size: float | Sequence[float] = 1.0
+    ) -> None:
+        super().__init__()
+        lookup(NORMAL_CONVENTIONS, "convention", convention)
+        self.convention, self.pixel_size = convention, _pixel_size(pixel_size, camera)
+        if isinstance(camera, nn.Parameter):
+            self.register_parameter("camera", camera)
+        else:
+            self.register_buffer("camera", camera)
+
+    def extra_repr(self) -> str:
+        """The options, for `repr`."""
+        return f"{self.convention!r}, pixel_size={self.pixel_size}"
+
+
+class NormalsToGradient(_Conversion):
+    """`normals_to_gradient` as a module: normals (N, 3, H, W) in, gradient (N, 2, H, W) out.
+
+    `nn.Sequential(normal_net, NormalsToGradient(), DLS())` trains through the integration. Invalid pixels get slope 0
+    and derivative 0; call `normals_to_gradient` to know which they are. A camera that is an `nn.Parameter` is
+    trained, a plain tensor is a buffer.
+    """
+
+    def __init__(
+        self,
+        convention: str = "opengl",
+        *,
+        camera: Tensor | None = None,
+        pixel_size: float | Sequence[float] = 1.0,
+        eps: float = 1e-2,
+    ) -> None:
+        super().__init__(convention, camera=camera, pixel_size=pixel_size)
+        self.eps = eps
+
+    def forward(self, normals: Tensor) -> Tensor:
+        """Gradient (N, 2, H, W) of normals (N, 3, H, W)."""
+        field = normals_to_gradient(
+            normals, self.convention, camera=self.camera, pixel_size=self.pixel_size, eps=self.eps
+        )
+        return field.gradient
+
+
+class GradientToNormals(_Conversion):
+    """`gradient_to_normals` as a module: gradient (N, 2, H, W) in, unit normals (N, 3, H, W) out."""
+
+    def forward(self, gradient: Tensor) -> Tensor:
+        """Normals (N, 3, H, W) of a gradient (N, 2, H, W)."""
+        return gradient_to_normals(gradient, self.convention, camera=self.camera, pixel_size=self.pixel_size)
+
+
+def guess_convention(
+    normals: Tensor, mask: Tensor | None = None, candidates: Sequence[str] = ("opengl", "directx")
+) -> ConventionGuess:
+    r"""Which convention makes the normals most nearly those of a surface.
+
+    Second derivatives commute, so each reading is scored by the curl of its gradient over complete 2x2 cells,
+    relative to the two terms that should cancel, the whole batch together:
+
+        residual = sum |D_x g_y - D_y g_x| / sum (|D_x g_y| + |D_y g_x|)
+
+    This tells OpenGL from DirectX as far as the surface is twisted (z_xy is not 0); residuals close to each other mean
+    that the data does not tell. Readings that differ by the sign of the height alone can never be told apart.
+
+    Args:
+        normals: (N, 3, H, W) or (3, H, W).
+        mask: (N, 1, H, W) bool; default: all pixels.
+        candidates: conventions to compare.
+
+    Raises as `normals_to_gradient` does, and ValueError if no candidate has a complete 2x2 cell of valid pixels.
+    """
+    residual = {}
+    for name in candidates:
+        field = normals_to_gradient(normals.detach(), name, mask=mask)
+        pairs = field.mask[..., 1:] & field.mask[..., :-1]
+        cells = pairs[..., 1:, :] & pairs[..., :-1, :]
+        gx, gy = field.gradient.split(1, -3)
+        slope_y, slope_x = (gy[..., 1:, :] + gy[..., :-1, :]) / 2, (gx[..., 1:] + gx[..., :-1]) / 2
+        a, b = slope_y.diff(dim=-1) * cells, slope_x.diff(dim=-2) * cells
+        total = float((a.abs() + b.abs()).sum())
+        # A plane is a surface in every reading; a reading without any cell is none.
+        residual[name] = float((a - b).abs().sum()) / total if total else 0.0 if cells.any() else float("inf")
+    if not residual or min(residual.values()) == float("inf"):
+        raise ValueError(f"normals: no 2x2 cell of valid pixels in any of the conventions {', '.join(candidates)}")
+    return ConventionGuess(min(residual, key=residual.__getitem__), residual)
+
+
+def _length(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    return torch.hypot(torch.hypot(a.detach(), b.detach()), c.detach())  # no overflow in the square; only compared with
+
+
+def _pixel_size(pixel_size: float | Sequence[float], camera: Tensor | None) -> tuple[float, float]:
+    pair = as_pixel_size(pixel_size)
+    if camera is not None and pair != (1.0, 1.0):
+        raise ValueError(f"pixel_size: {pixel_size!r} given beside a camera, whose intrinsics already hold it")
+    return pair

@@ -1,0 +1,21 @@
+"""Classic integrators: one solve or one transform each."""
+
+from torchdls.integrators.classic.fourier import FrankotChellappa
+from torchdls.integrators.classic.global_least_squares import (
+    HarkerOLeary,
+    SpectralRegularization,
+    TikhonovRegularization,
+)
+from torchdls.integrators.classic.horn_brooks import HornBrooks
+from torchdls.integrators.classic.least_squares import LeastSquares
+from torchdls.integrators.classic.line_integral import LineIntegral
+
+__all__ = [
+    "FrankotChellappa",
+    "HarkerOLeary",
+    "HornBrooks",
+    "LeastSquares",
+    "LineIntegral",
+    "SpectralRegularization",
+    "TikhonovRegularization",
+]

@@ -1,0 +1,91 @@
+"""The plain iteration toward least squares."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchdls.integrators.base import Fields, Integrator
+from torchdls.operators import GradientOperator, edge_slopes
+from torchdls.operators.edges import edge_ends
+from torchdls.solvers import ConvergenceWarning
+from torchdls.solvers.components import free_constants
+
+
+class HornBrooks(Integrator):
+    r"""Least squares by relaxation: each pixel moves to the mean of what its neighbours say.
+
+        z_i <- z_i + s ( (sum_e w_e (z_j +- v_e) + r_i a_i) / (sum_e w_e + r_i) - z_i )
+
+    over the edges e = (i, j) at pixel i (with 1/dx^2 or 1/dy^2 in the weights). The pixels of the two colours of a
+    checkerboard take turns: all at once, the iteration of the source never settles. It tends to the surface of
+    `LeastSquares`, in O(N^2) iterations for N x N pixels with s = 1, and in O(N) with s near 2/(1 + sin(pi/2N)). A
+    reference for teaching and tests: `LeastSquares` finds the same surface at once.
+
+    The derivative is that of the iterations, and memory grows with them while gradients are recorded.
+
+    Args:
+        tol: relative residual of the normal equations at which a surface stops.
+        max_iter: limit of iterations; a `ConvergenceWarning` says when it was reached.
+        relaxation: s, in (0, 2).
+        pixel_size: (dx, dy) or one number; heights come out in its unit.
+
+    Raises:
+        ValueError: an option is out of its range.
+
+    Source: Horn, Brooks, "The Variational Approach to Shape from Shading", Computer Vision, Graphics, and Image
+    Processing 33, 1986; Durou, Courteille (2007) for the border.
+    """
+
+    def __init__(
+        self,
+        tol: float = 1e-6,
+        max_iter: int = 10_000,
+        relaxation: float = 1.0,
+        *,
+        pixel_size: float | Sequence[float] = 1.0,
+    ) -> None:
+        super().__init__(pixel_size=pixel_size)
+        if not tol > 0 or not max_iter > 0:
+            raise ValueError(f"HornBrooks: tol={tol!r} and max_iter={max_iter!r} given, both must be positive")
+        if not 0 < relaxation < 2:
+            raise ValueError(f"HornBrooks: relaxation={relaxation!r} given, a number between 0 and 2 is needed")
+        self.tol, self.max_iter, self.relaxation = tol, max_iter, relaxation
+
+    def integrate(self, fields: Fields) -> Tensor:
+        """Height (N, 1, H, W) in pixels."""
+        a = GradientOperator("forward", fields.steps)
+        g = fields.gradient
+        mask = torch.ones_like(g[:, :1], dtype=torch.bool) if fields.mask is None else fields.mask
+        v, w = edge_slopes(g, mask, fields.weight)
+        assert w is not None
+        r = w.new_zeros(w.shape[0], 1, 1, 1) if fields.anchor_weight is None else fields.anchor_weight
+        b = a.adjoint(w * v) if fields.anchor is None else a.adjoint(w * v) + r * fields.anchor
+        diagonal = edge_ends(w / w.new_tensor(fields.steps).square().view(1, 2, 1, 1)) + r
+        step = self.relaxation / torch.where(diagonal > 0, diagonal, 1)
+        i, j = (torch.arange(n, device=b.device) for n in b.shape[-2:])
+        colour = (i[:, None] + j) % 2 == 0
+        goal = self.tol * b.detach().flatten(1).norm(dim=1)
+        z, active = torch.zeros_like(b), torch.ones_like(goal, dtype=torch.bool)
+        for _ in range(self.max_iter):
+            residual = b - a.adjoint(w * a(z)) - r * z
+            active = active & (residual.detach().flatten(1).norm(dim=1) > goal)
+            if not bool(active.any()):
+                break
+            turn = active.view(-1, 1, 1, 1)
+            z = z + torch.where(turn & colour, step * residual, 0)
+            residual = b - a.adjoint(w * a(z)) - r * z
+            z = z + torch.where(turn & ~colour, step * residual, 0)
+        else:
+            message = f"HornBrooks: {int(active.sum())} of {len(b)} surfaces above tol={self.tol:g}"
+            warnings.warn(f"{message} after {self.max_iter} iterations", ConvergenceWarning, stacklevel=2)
+        return free_constants(w.detach(), r.expand_as(z).detach()).remove(z)
+
+    def extra_repr(self) -> str:
+        """The settings, as `print` shows them."""
+        return (
+            f"tol={self.tol:g}, max_iter={self.max_iter}, relaxation={self.relaxation:g}, pixel_size={self.pixel_size}"
+        )

@@ -1,0 +1,51 @@
+"""The cost of DLS, for any height, dictionary and codes."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchdls.integrators.classic.least_squares import LeastSquares
+from torchdls.integrators.dls.problem import patch_cost
+from torchdls.operators import Patches
+
+
+def dls_objective(
+    height: Tensor,
+    gradient: Tensor,
+    dictionary: Tensor,
+    codes: Tensor,
+    lam: float | Tensor,
+    mu: float | Tensor,
+    *,
+    patches: Patches | None = None,
+    mask: Tensor | None = None,
+    weight: Tensor | None = None,
+) -> Tensor:
+    r"""The cost that DLS minimises, per surface.
+
+        1/2 \sum_e w_e ((A z)_e - v_e)^2 + lam ( \sum_j ||M_j (P_j z - D b_j)||^2 + mu^2 ||B||_0 )
+
+    with M_j the valid pixels of patch j (all of them without a mask).
+
+    Args:
+        height: (N, 1, H, W), in pixels.
+        gradient: (N, 2, H, W).
+        dictionary: (N or 1, n, K).
+        codes: (N, K, L).
+        lam: a number or (N,).
+        mu: a number or (N,).
+        patches: the patches; `Patches(8, 2)` by default.
+        mask: (N, 1, H, W) bool.
+        weight: (N, 1 or 2, H, W).
+
+    Returns:
+        (N,).
+    """
+    patches = Patches() if patches is None else patches
+    data = LeastSquares()
+    fields = data.check(gradient, mask, weight)
+    valid = None if fields.mask is None else patches.extract(fields.mask.to(height.dtype)) > 0
+    mu = torch.as_tensor(mu, dtype=height.dtype, device=height.device).expand(height.shape[0])
+    R = patches.extract(height) - dictionary @ codes
+    return data.data_cost(fields, height) + lam * patch_cost(R, codes, mu, valid)
