@@ -14,6 +14,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.dictionary import FixedDictionary as FixedDictionary
     from torchdls.dictionary import Learner as Learner
     from torchdls.dictionary import SoupDIL as SoupDIL
+    from torchdls.dictionary import Unitary as Unitary
     from torchdls.dictionary import dct_dictionary as dct_dictionary
     from torchdls.dictionary import orthogonal_matching_pursuit as orthogonal_matching_pursuit
     from torchdls.dictionary import soup_dil_sweep as soup_dil_sweep
@@ -130,6 +131,7 @@ _MODULE_OF = {
     "FixedDictionary": "dictionary",
     "Learner": "dictionary",
     "SoupDIL": "dictionary",
+    "Unitary": "dictionary",
     "orthogonal_matching_pursuit": "dictionary",
     "soup_dil_sweep": "dictionary",
     # normals, gradients, cameras

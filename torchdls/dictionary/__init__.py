@@ -4,6 +4,7 @@ from torchdls.dictionary.initial import dct_dictionary
 from torchdls.dictionary.learners import KSVD, LEARNERS, DinoKat, FixedDictionary, Learner, SoupDIL
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import soup_dil_sweep
+from torchdls.dictionary.unitary import Unitary
 
 __all__ = [
     "KSVD",
@@ -12,6 +13,7 @@ __all__ = [
     "FixedDictionary",
     "Learner",
     "SoupDIL",
+    "Unitary",
     "dct_dictionary",
     "orthogonal_matching_pursuit",
     "soup_dil_sweep",

@@ -19,6 +19,7 @@ from torch import Tensor
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
 from torchdls.dictionary.thresholds import Threshold
+from torchdls.dictionary.unitary import Unitary
 
 Step = tuple[Tensor, Tensor, Tensor]
 
@@ -198,10 +199,11 @@ def _replace_unused(D: Tensor, R: Tensor, B: Tensor) -> Tensor:
     return torch.where(unused[:, None], _unit(patches, D), D)
 
 
-LEARNERS: dict[str, type[SoupDIL] | type[FixedDictionary] | type[DinoKat] | type[KSVD]] = {
+LEARNERS: dict[str, type[SoupDIL] | type[FixedDictionary] | type[DinoKat] | type[KSVD] | type[Unitary]] = {
     "soup_dil": SoupDIL,
     "k_svd": KSVD,
     "fixed": FixedDictionary,
     "dino_kat": DinoKat,
+    "unitary": Unitary,
 }
 """The learners by name."""

@@ -98,8 +98,8 @@ class DLS(Iterative[DLSResult]):
         n_prox: proximal gradient steps per iteration.
         bound: bound a on the codes, for heights in pixels.
         unused: rule for atoms that no patch uses, "first" or "keep" (see `soup_dil_sweep`).
-        learner: "soup_dil", "k_svd", "dino_kat", "fixed", or a `Learner` such as `KSVD(n_nonzero=4)`; None is
-            `SoupDIL(order, unused, threshold)`.
+        learner: "soup_dil", "k_svd", "dino_kat", "unitary", "fixed", or a `Learner` such as `KSVD(n_nonzero=4)`; None
+            is `SoupDIL(order, unused, threshold)`.
         tol: a surface stops once a step moves its height by less than `tol` times the whole way from the first height;
             0 runs all iterations.
         threshold: "hard" (the paper's), or "soft" or "firm" (see `torchdls.dictionary.thresholds`), with which `mu` can

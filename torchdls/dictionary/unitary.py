@@ -1,0 +1,56 @@
+"""A learner whose dictionary stays orthonormal: both of its steps are exact."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchdls.dictionary.thresholds import Threshold, shrink
+
+
+@dataclass(frozen=True)
+class Unitary:
+    r"""Orthonormal dictionaries: min over D, B of \sum_j ||P_j - D b_j||^2 + mu^2 ||B||_0 with D^T D = I.
+
+        B = shrink(D^T P, mu)        D = U V^T, where P B^T = U S V^T
+
+    Each step is the exact minimum over its variable, so a pass never raises the cost. The dictionary must be square,
+    and the codes leave no patch of it out: K = n. Differentiable where the singular values of P B^T differ.
+
+    Args:
+        threshold: "hard", "soft" or "firm".
+
+    Source: Ravishankar, Bresler, "Closed-form solutions within sparsifying transform learning", ICASSP 2013; the
+    orthogonal Procrustes problem: Schoenemann 1966.
+    """
+
+    threshold: Threshold = "hard"
+
+    def __call__(
+        self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One pass: codes, then the dictionary."""
+        n, K = D.shape[-2:]
+        if n != K:
+            raise ValueError(f"Unitary: dictionary {tuple(D.shape)} given, a square one (N, n, n) is needed")
+        P = R + D @ B
+        level = torch.as_tensor(mu, dtype=R.dtype, device=R.device)
+        level = level[..., None] if level.ndim else level
+        B = shrink(D.mT @ P, level, bound, self.threshold)
+        if learn:
+            moment = P @ B.mT
+            D = _nearest(moment if D.shape[0] == P.shape[0] else moment.sum(0, keepdim=True), D)
+        return P - D @ B, D, B
+
+
+def _nearest(moment: Tensor, D: Tensor) -> Tensor:
+    """argmax over orthonormal X of <X, moment>; D itself where the moment is 0, which leaves X free."""
+    some = (moment != 0).flatten(1).any(1)[:, None, None]
+    n = D.shape[-1]
+    # What stands in for 0 has singular values that differ: their derivative is finite, and goes nowhere.
+    ladder = D * torch.arange(1, n + 1, dtype=D.dtype, device=D.device)
+    u, _, v = torch.linalg.svd(torch.where(some, moment, ladder))
+    return torch.where(some, u @ v, D)
