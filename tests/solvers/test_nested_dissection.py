@@ -1,0 +1,98 @@
+"""The direct solver on masks, against dense and sparse solves of the same matrix."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+import torch
+from scipy.sparse.linalg import spsolve
+
+from torchdls.operators import GradientOperator
+from torchdls.solvers.nested_dissection import elimination, factor
+
+
+def edges_within(mask, w):
+    w = w.clone()
+    w[:, :1, :, :-1] *= mask[..., 1:] & mask[..., :-1]
+    w[:, 1:, :-1] *= mask[:, :, 1:] & mask[:, :, :-1]
+    w[:, 0, :, -1] = 0
+    w[:, 1, -1] = 0
+    return w
+
+
+def problem(n, h, w, contrast, generator):
+    """Masks with holes (the last one full), weights over many orders, weak anchors everywhere, a right-hand side."""
+    mask = torch.rand(n, 1, h, w, generator=generator) > 0.2
+    mask[:, :, 0, 0] = True
+    mask[-1] = True
+    exponents = torch.rand(n, 2, h, w, generator=generator, dtype=torch.float64)
+    weight = edges_within(mask, 10 ** (contrast * (exponents - 1)))
+    r = 1e-3 * torch.rand(n, 1, h, w, generator=generator, dtype=torch.float64) * mask
+    return mask, weight, r, torch.randn(n, 1, h, w, generator=generator, dtype=torch.float64) * mask
+
+
+def dense(weight, r, pixel_size):
+    """H of one surface from its definition, column by column."""
+    h, w = r.shape[-2:]
+    columns = GradientOperator("forward", pixel_size)(torch.eye(h * w, dtype=torch.float64).view(-1, 1, h, w))
+    A = columns.flatten(1)
+    return (A * weight.flatten()) @ A.T + torch.diag(r.flatten())
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (9, 1), (3, 3), (7, 5), (13, 22), (30, 17)])
+@pytest.mark.parametrize("pixel_size", [(1.0, 1.0), (0.5, 2.0)])
+def test_equals_a_dense_solve(size, pixel_size, generator):
+    mask, weight, r, b = problem(3, *size, 6, generator)
+    z = factor(weight, r, pixel_size).solve(b)
+    for k in range(3):
+        alive = mask[k].flatten()
+        H = dense(weight[k], r[k], pixel_size)[alive][:, alive]
+        expected = torch.zeros_like(b[k].flatten())
+        expected[alive] = torch.linalg.solve(H, b[k].flatten()[alive])
+        torch.testing.assert_close(z[k].flatten(), expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
+
+
+def test_equals_a_sparse_solve_on_a_larger_mask(generator):
+    y, x = torch.meshgrid(torch.linspace(-1, 1, 120), torch.linspace(-1, 1, 90), indexing="ij")
+    mask = ((x.square() + y.square() < 0.9) & ((x - 0.3).square() + y.square() > 0.04))[None, None]
+    weight = edges_within(
+        mask, 10 ** (-8 * (torch.rand(1, 2, 120, 90, generator=generator, dtype=torch.float64) > 0.95))
+    )
+    r = 1e-4 * mask.double()
+    b = torch.randn(1, 1, 120, 90, generator=generator, dtype=torch.float64) * mask
+    pixel = np.arange(120 * 90).reshape(120, 90)
+    ends = np.concatenate([np.stack([pixel[:, :-1], pixel[:, 1:]], -1).reshape(-1, 2),
+                           np.stack([pixel[:-1], pixel[1:]], -1).reshape(-1, 2)])  # fmt: skip
+    w = np.concatenate([weight[0, 0, :, :-1].flatten(), weight[0, 1, :-1].flatten()])
+    D = sparse.csr_array((np.repeat([[-1.0, 1.0]], len(w), 0).ravel(), ends.ravel(), np.arange(0, 2 * len(w) + 1, 2)))
+    H = (D.T @ sparse.diags_array(w) @ D + sparse.diags_array(r.flatten().numpy())).tocsc()
+    alive = mask.flatten().numpy()
+    expected = np.zeros(alive.shape)
+    expected[alive] = spsolve(H[alive][:, alive], b.flatten().numpy()[alive])
+    found = factor(weight, r).solve(b).flatten().numpy()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+
+
+def test_a_surface_does_not_depend_on_its_batch(generator):
+    _, weight, r, b = problem(3, 21, 18, 4, generator)
+    together = factor(weight, r).solve(b)
+    for k in range(3):
+        alone = factor(weight[k : k + 1], r[k : k + 1]).solve(b[k : k + 1])
+        torch.testing.assert_close(together[k : k + 1], alone, rtol=1e-10, atol=1e-10 * float(alone.abs().max()))
+
+
+def test_single_precision_comes_back_single_and_right(generator):
+    _, weight, r, b = problem(1, 21, 18, 2, generator)
+    expected = factor(weight.float(), r.float()).solve(b.float().double())
+    found = factor(weight.float(), r.float()).solve(b.float())
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, expected.float())
+
+
+def test_every_pixel_is_eliminated_once_and_every_edge_enters_once(generator):
+    mask = torch.rand(2, 23, 31, generator=generator) > 0.3
+    levels = elimination(mask)
+    fronts = [front for level in levels for front in level]
+    pixels = torch.cat([f.own[f.own < mask.numel()] for f in fronts]).sort().values
+    assert torch.equal(pixels, mask.flatten().nonzero()[:, 0])
+    n_edges = int((mask[..., 1:] & mask[..., :-1]).sum() + (mask[:, 1:] & mask[:, :-1]).sum())
+    assert len(torch.cat([f.edges[1] for f in fronts]).unique()) == n_edges
