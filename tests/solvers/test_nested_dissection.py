@@ -64,7 +64,7 @@ def test_equals_a_sparse_solve_on_a_larger_mask(generator):
                            np.stack([pixel[:-1], pixel[1:]], -1).reshape(-1, 2)])  # fmt: skip
     w = np.concatenate([weight[0, 0, :, :-1].flatten(), weight[0, 1, :-1].flatten()])
     D = sparse.csr_array((np.repeat([[-1.0, 1.0]], len(w), 0).ravel(), ends.ravel(), np.arange(0, 2 * len(w) + 1, 2)))
-    H = (D.T @ sparse.diags_array(w) @ D + sparse.diags_array(r.flatten().numpy())).tocsc()
+    H = (D.T @ sparse.diags_array(w, dtype=float) @ D + sparse.diags_array(r.flatten().numpy(), dtype=float)).tocsc()
     alive = mask.flatten().numpy()
     expected = np.zeros(alive.shape)
     expected[alive] = spsolve(H[alive][:, alive], b.flatten().numpy()[alive])
