@@ -33,6 +33,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.integrators import INTEGRATORS as INTEGRATORS
     from torchdls.integrators import L1 as L1
     from torchdls.integrators import AnisotropicDiffusion as AnisotropicDiffusion
+    from torchdls.integrators import Bilateral as Bilateral
     from torchdls.integrators import DLSResult as DLSResult
     from torchdls.integrators import FrankotChellappa as FrankotChellappa
     from torchdls.integrators import HarkerOLeary as HarkerOLeary
@@ -111,6 +112,7 @@ _MODULE_OF = {
     "L1": "integrators",
     "MEstimator": "integrators",
     "AnisotropicDiffusion": "integrators",
+    "Bilateral": "integrators",
     "MumfordShah": "integrators",
     "RobustResult": "integrators",
     "TotalVariation": "integrators",

@@ -62,6 +62,7 @@ INTEGRATORS = Registry(
         "huber": "Huber",
         "m_estimator": "MEstimator",
         "anisotropic_diffusion": "AnisotropicDiffusion",
+        "bilateral": "Bilateral",
         "mumford_shah": "MumfordShah",
         "dls": "DLS",
         "slope_dls": "SlopeDLS",

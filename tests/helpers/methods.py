@@ -44,6 +44,11 @@ METHODS: dict[str, Method] = {
     "huber": Method({"n_iter": 10}, tol=1e-4, no=ONE_SCALE),
     "m_estimator": Method({"n_iter": 5, "floor": 0.1}, tol=1e-3, no=ONE_SCALE),
     "anisotropic_diffusion": Method({"beta": 0.2, "n_iter": 10}, tol=1e-4, no=ONE_SCALE),
+    "bilateral": Method(
+        {"n_iter": 4, "tol": 0.0, "solve_tol": 1e-10},
+        tol=1e-3,
+        no={"scales_with_the_slopes": "the rule compares with one pixel"},
+    ),
     "mumford_shah": Method({"n_iter": 5, "floor": 0.1}, tol=1e-3, no=ONE_SCALE),
     "dls": Method(
         {"patch_size": 4, "stride": 2, "n_atoms": 16, "mu": 0.3, "n_iter": 3, "tol": 0.0, "unused": "keep"},

@@ -18,6 +18,7 @@ from torchdls import (
     INTEGRATORS,
     L1,
     AnisotropicDiffusion,
+    Bilateral,
     HornBrooks,
     Huber,
     Integrator,
@@ -61,6 +62,7 @@ VARIANTS: dict[str, dict[str, Callable[[], Integrator]]] = {
         "tukey": lambda: MEstimator("tukey", floor=0.1, **FEW),
     },
     "anisotropic_diffusion": {"default": lambda: AnisotropicDiffusion(beta=0.2, **FEW)},
+    "bilateral": {"default": lambda: Bilateral(**FEW)},
     "mumford_shah": {"default": lambda: MumfordShah(floor=0.1, **FEW)},
     "dls": {
         "default": dls(),

@@ -313,3 +313,21 @@ def test_harmonic_extension_is_the_smoothest_one(pixel_size):
     H, _ = normal_equations(torch.zeros(2, 20, 18).double(), None, None, None, pixel_size)
     outside = ~inside.numpy().ravel()
     np.testing.assert_allclose((H @ u.numpy().ravel())[outside], 0, atol=1e-8)
+
+
+def test_weights_that_jump_by_many_orders_are_solved_exactly(generator):
+    """Curves cut by 1e-8 through a mask: far too much for the cosine preconditioner; against SciPy's sparse solve."""
+    n = 48
+    y, x = torch.meshgrid(torch.linspace(-1, 1, n), torch.linspace(-1, 1, n), indexing="ij")
+    mask = (x.square() + y.square() < 0.95)[None, None]
+    side = (torch.sin(7 * x) + torch.cos(5 * y + x) > 0)[None, None]
+    w = edge_slopes(mask.double().expand(-1, 2, -1, -1), mask)[1]
+    cut = torch.zeros_like(w, dtype=torch.bool)
+    cut[:, 0, :, :-1] = (side[..., 1:] ^ side[..., :-1])[:, 0]
+    cut[:, 1, :-1] = (side[:, :, 1:] ^ side[:, :, :-1])[:, 0]
+    w = torch.where(cut, 1e-8 * w, w)
+    v = torch.randn(1, 2, n, n, generator=generator, dtype=torch.float64)
+    found = solve(v, w, tol=1e-9)
+    assert bool(found.converged.all())
+    assert 60 < int(found.iterations) <= 63  # the patience, and at most three steps with the factor
+    assert_solves(found.height, v, w, atol=1e-6)

@@ -15,6 +15,7 @@ from torchdls.integrators.dls import DLS, DLSResult, dls_objective
 from torchdls.integrators.robust import (
     L1,
     AnisotropicDiffusion,
+    Bilateral,
     Huber,
     MEstimator,
     MumfordShah,
@@ -26,6 +27,7 @@ from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
 
 __all__ = [
     "AnisotropicDiffusion",
+    "Bilateral",
     "Huber",
     "L1",
     "MEstimator",

@@ -19,6 +19,11 @@ class CGResult(NamedTuple):
     residual: Tensor
     converged: Tensor
 
+    def replace(self, systems: Tensor, other: CGResult) -> CGResult:
+        """With what was found for some of the systems since; their iterations add up."""
+        other = other._replace(iterations=self.iterations[systems] + other.iterations)
+        return CGResult(*(own.index_copy(0, systems, new) for own, new in zip(self, other, strict=True)))
+
 
 def conjugate_gradients(
     apply: LinearMap,

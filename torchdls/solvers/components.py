@@ -35,6 +35,22 @@ class Gauge(NamedTuple):
         sums = torch.zeros_like(flat).scatter_add(1, self.labels, flat)
         return (flat - sums.gather(1, self.labels) * self.share).view_as(x)
 
+    def select(self, surfaces: Tensor) -> Gauge:
+        """Of some surfaces of the batch."""
+        return Gauge(self.labels[surfaces], self.share[surfaces])
+
+    def double(self) -> Gauge:
+        """In double precision."""
+        count = torch.where(self.share > 0, (1 / torch.where(self.share > 0, self.share, 1)).round(), 1)
+        return Gauge(self.labels, torch.where(self.share > 0, 1 / count.double(), 0))
+
+    def pins(self) -> Tensor:
+        """(N, H * W) bool, one pixel of every free component."""
+        free = self.share > 0
+        if self.labels.shape[1]:
+            return free & (self.labels == torch.arange(free.shape[1], device=free.device))
+        return free & (free.cumsum(1) == 1)
+
     def correction(self) -> Callable[[Tensor], Tensor] | None:
         """The same for repeated use on fields that rounding alone took off, which may be overwritten; None for none."""
         if not bool(self.share.any()):

@@ -10,10 +10,17 @@ from torch import Tensor
 
 from torchdls.operators import GradientOperator, as_pixel_size
 from torchdls.operators.edges import edge_ends, present_edges
-from torchdls.solvers.cg import LinearMap, conjugate_gradients
+from torchdls.solvers.cg import CGResult, LinearMap, conjugate_gradients
 from torchdls.solvers.components import Gauge, free_constants
 from torchdls.solvers.direct import solve_direct
+from torchdls.solvers.nested_dissection import factor
 from torchdls.solvers.preconditioner import preconditioner
+
+# Steps of conjugate gradients after which a direct factor is cheaper; pixels of a batch up to which its memory (2 GB)
+# is spent; steps that it then takes at most.
+_PATIENCE = 60
+_LARGEST = 2**22
+_DIRECT_STEPS = 30
 
 
 class ConvergenceWarning(UserWarning):
@@ -63,9 +70,10 @@ def solve(
     with A the forward differences, so H z = A^T (w v) + r a with H = A^T diag(w) A + diag(r).
 
     Where w is None and r is one number per surface, H is diagonal in the cosine basis and the solve is direct.
-    Otherwise conjugate gradients run, preconditioned by such a direct solve. On a connected component (of the edges
-    with w > 0) that no anchor holds, the height has zero mean; pixels with neither edge nor anchor are 0. No ridge is
-    added.
+    Otherwise conjugate gradients run, preconditioned by such a direct solve; where weights jump by so many orders that
+    60 steps do not suffice, a direct factor by nested dissection takes over (up to 4 million pixels). On a connected
+    component (of the edges with w > 0) that no anchor holds, the height has zero mean; pixels with neither edge nor
+    anchor are 0. No ridge is added.
 
     The derivative is implicit and as exact as the solve itself: with lambda = H^{-1} dL/dz,
     dL/dv = w A lambda, dL/dw = (v - A z)(A lambda), dL/da = r lambda, dL/dr = (a - z) lambda. Memory does not grow
@@ -156,15 +164,7 @@ class _Solve(torch.autograd.Function):
         b, w, r = (t[..., rows, columns] for t in (b, w, r))
         z0 = None if z0 is None else z0[..., rows, columns]
         gauge = free_constants(w, r) if labels is None or share is None else Gauge(labels, share)
-        x, iterations, residual, converged = conjugate_gradients(
-            _normal(w, r, setting),
-            preconditioner(w, r, setting.pixel_size),
-            gauge.remove(gauge.remove(b)),  # again: a mean left by rounding lies outside the range of H
-            z0,
-            tol=setting.tol,
-            max_iter=setting.max_iter,
-            project=gauge.correction(),
-        )
+        x, iterations, residual, converged = _iterate(b, w, r, z0, gauge, setting)
         if not bool(converged.all()):
             _warn(residual, converged, setting)
         z[..., rows, columns] = gauge.remove(x)
@@ -205,6 +205,40 @@ class _Solve(torch.autograd.Function):
     def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         outputs = _Solve.apply(*fold_vmap(info.batch_size, in_dims, inputs))
         return tuple(x.unflatten(0, (info.batch_size, -1)) for x in outputs), (0,) * len(outputs)
+
+
+def _iterate(b: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, setting: _Setting) -> CGResult:
+    """Conjugate gradients with the cosine preconditioner; with a direct factor where weights jump too much for that.
+
+    The factor costs as much as `_PATIENCE` steps (measured from 128^2 to 512^2), so at worst half of the work is lost.
+    """
+    b = gauge.remove(gauge.remove(b))  # again: a mean left by rounding lies outside the range of H
+    patience = _PATIENCE if b[0].numel() * b.shape[0] <= _LARGEST else setting.max_iter
+    found = conjugate_gradients(
+        _normal(w, r, setting), preconditioner(w, r, setting.pixel_size), b, z0,
+        tol=setting.tol, max_iter=min(patience, setting.max_iter), project=gauge.correction(),
+    )  # fmt: skip
+    if bool(found.converged.all()) or patience >= setting.max_iter:
+        return found
+    rest = (~found.converged).nonzero()[:, 0]
+    return found.replace(rest, _directly(b[rest], w[rest], r[rest], found.x[rest], gauge.select(rest), setting))
+
+
+def _directly(b: Tensor, w: Tensor, r: Tensor, x: Tensor, gauge: Gauge, setting: _Setting) -> CGResult:
+    """The same, preconditioned by a direct factor and in double precision; one step mostly, three where H is singular.
+
+    In the factor alone, one pixel of every free component is held by as much as its edges weigh.
+    """
+    dtype, gauge = b.dtype, gauge.double()
+    b, w, r, x = (t.double() for t in (b, w, r, x))
+    scale = torch.tensor(setting.pixel_size, dtype=w.dtype, device=w.device).view(1, 2, 1, 1)
+    held = r + torch.where(gauge.pins().view_as(r), edge_ends(w / scale.square()), 0)
+    direct = factor(w, held, setting.pixel_size)
+    found = conjugate_gradients(
+        _normal(w, r, setting), lambda y: gauge.remove(direct.solve(y)), gauge.remove(b), x,
+        tol=setting.tol, max_iter=_DIRECT_STEPS, project=gauge.correction(),
+    )  # fmt: skip
+    return found._replace(x=found.x.to(dtype), residual=found.residual.to(dtype))
 
 
 def fold_vmap(size: int, in_dims: tuple[int | None, ...], inputs: tuple[Any, ...]) -> list[Any]:

@@ -2,6 +2,7 @@
 
 from torchdls.integrators.robust.anisotropic_diffusion import AnisotropicDiffusion
 from torchdls.integrators.robust.base import Robust, RobustResult
+from torchdls.integrators.robust.bilateral import Bilateral
 from torchdls.integrators.robust.convex import L1, Huber, TotalVariation
 from torchdls.integrators.robust.m_estimator import MEstimator
 from torchdls.integrators.robust.mumford_shah import MumfordShah
@@ -9,6 +10,7 @@ from torchdls.integrators.robust.weighted import WeightedLeastSquares
 
 __all__ = [
     "AnisotropicDiffusion",
+    "Bilateral",
     "Huber",
     "L1",
     "MEstimator",
