@@ -166,6 +166,8 @@ def _reason(error: Exception) -> str:
         return "there is not enough memory"
     if isinstance(error, (KeyError, IndexError, AttributeError, AssertionError, TypeError, struct.error)):
         return "its content is damaged"  # the decoder stumbled, and its words mean nothing to the reader
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     lines = str(error).strip().splitlines()
     return lines[0] if lines else "its content is damaged"
 

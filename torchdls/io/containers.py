@@ -96,7 +96,7 @@ def open_mat(path: Path) -> Archive:
     scipy_io: Any = require("scipy.io", "files")
     try:
         found = scipy_io.whosmat(path, appendmat=False)
-    except NotImplementedError:
+    except RuntimeError:  # what scipy says of HDF5
         raise ValueError("it is a MAT file of version 7.3; store it with save(..., '-v7')") from None
     numeric = {"double": 8, "single": 4, "uint8": 1, "uint16": 2, "logical": 1}
     sizes = {name: math.prod(shape) * numeric[kind] for name, shape, kind in found if kind in numeric}

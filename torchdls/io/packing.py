@@ -15,7 +15,7 @@ With an `a` at the end (`rgba`, `rgza`, `rga`, `xyza`) alpha is the mask; otherw
 **The rule.** Black, gray and white pixels are background and have no say. Of the packings with three components the
 one whose vectors have length 1 most nearly (median of | |n| - 1 |) is taken, the more usual one unless another is
 twice as good; it must come within `FITS` and most normals must not lie at grazing angle. Where blue says nothing of
-z (it varies much less than sqrt(1 - x^2 - y^2)) or none of them fits, `rg` and `ag` are tried: x^2 + y^2 <= 1 must
+z (it does not follow sqrt(1 - x^2 - y^2)) or none of them fits, `rg` and `ag` are tried: x^2 + y^2 <= 1 must
 hold. A map that fits none is an error. Alpha is a mask where it is almost everywhere 0 or 1.
 """
 
@@ -149,9 +149,10 @@ def _find(channels: Array, candidates: list[Array]) -> tuple[str, Array]:
     packed = bool((((last < -0.05) | (last > 1.05))[:, :3].mean()) < 0.05)
     misfit: dict[str, float] = {}
     if channels.shape[-1] > 2:
-        if packed and not _blue_is_idle(last):
+        idle = _is_idle(_DECODE["rg"](last), last[:, 2])
+        if packed and not idle:
             misfit |= {name: _misfit(_DECODE[name](last)) for name in ("rgb", "rgz")}
-        if channels.dtype.kind == "f":
+        if channels.dtype.kind == "f" and not (packed and idle and _is_idle(_root(*first[:, :2].T), first[:, 2])):
             misfit["xyz"] = _misfit(first[:, :3])
     best = min(misfit.values(), default=np.inf)
     for name, value in misfit.items():
@@ -171,9 +172,10 @@ def _tell(misfit: dict[str, float]) -> str:
 
 
 def _misfit(n: Array) -> float:
-    """Median distance of the lengths from 1; infinite where most vectors lie in the plane of the picture."""
+    """Median distance of the lengths from 1; infinite where most vectors are at grazing angle."""
     n = n.astype(np.float64)
-    if np.median(np.abs(n[:, 2])) < 0.1:
+    x, y, z = np.median(np.abs(n), axis=0)
+    if z < 0.1 or max(x, y) > 0.95:
         return float("inf")
     return float(np.median(np.abs(np.linalg.norm(n, axis=-1) - 1)))
 
@@ -183,13 +185,15 @@ def _spread(values: Array) -> float:
     return float(high - low)
 
 
-def _blue_is_idle(c: Array) -> bool:
-    """Blue varies much less than the z that belongs to x and y."""
-    z = _DECODE["rg"](c)[:, 2]
-    z = z[np.isfinite(z)]
-    if len(z) < 0.95 * len(c):
+def _is_idle(n: Array, blue: Array) -> bool:
+    """Blue says nothing of z: it does not follow sqrt(1 - x^2 - y^2) where that varies (slope 0, not 1 or 1/2)."""
+    z, blue = n[:, 2].astype(np.float64), blue.astype(np.float64)
+    defined = np.isfinite(z)
+    if defined.mean() < 0.95 or _spread(z[defined]) < 0.04:
         return False
-    return _spread(z) > 0.04 and 2 * _spread(c[:, 2]) < 0.25 * _spread(z)
+    z, blue = z[defined], blue[defined]
+    z = z - z.mean()
+    return bool(abs(2 * (blue * z).sum()) < 0.4 * (z * z).sum())
 
 
 def _alpha_is_x(c: Array) -> bool:
