@@ -158,18 +158,19 @@ def naming(path: Path, form: str) -> Iterator[None]:
     except (FileNotFoundError, PermissionError, IsADirectoryError, ImportError):
         raise
     except Exception as error:
-        raise ValueError(f"{path}: cannot be read as {form}: {_reason(error)}") from error
+        raise ValueError(f"{path}: cannot be read as {form}: {_reason(path, error)}") from error
 
 
-def _reason(error: Exception) -> str:
+def _reason(path: Path, error: Exception) -> str:
+    """What a decoder says, where it speaks to the reader and not to the programmer."""
     if isinstance(error, MemoryError):
         return "there is not enough memory"
-    if isinstance(error, (KeyError, IndexError, AttributeError, AssertionError, TypeError, struct.error)):
-        return "its content is damaged"  # the decoder stumbled, and its words mean nothing to the reader
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else "its content is damaged"
+    stumbled = (LookupError, AttributeError, AssertionError, TypeError, ArithmeticError, UnicodeError, struct.error)
+    reason = next(iter(str(error).strip().splitlines()), "")
+    foreign = not reason.isprintable() or str(path) in reason or "b'" in reason
+    return "its content is damaged" if isinstance(error, stumbled) or foreign or not reason else reason
 
 
 def require(name: str, extra: str) -> ModuleType:

@@ -40,7 +40,7 @@ def add_integrate(commands: Any) -> None:
     add("--channels", metavar="PACKING", help="how the normals are packed, if it is not found right: rgb, rgz, rg, ag "
         "(x in alpha) or xyz (signed); with an a at the end, as in rgba, alpha is the mask")  # fmt: skip
     add("--convention", help="normals: opengl (default), directx, opencv, kornia, matlab, or auto (the most "
-        "integrable); gradients: image (default: right, down), cartesian (right, up), depth, matlab (down, right)")  # fmt: skip
+        "integrable); gradients: image (default: right, down), cartesian (right, up), depth, matlab")  # fmt: skip
     add("--pixel-size", type=float, nargs="+", metavar="D", help="spacing of the pixels, or of columns and rows")
     add("--camera", metavar="K", help="intrinsics, 3 x 3 in NPY, NPZ or text, or FX,FY,CX,CY in pixels: undo the "
         "perspective; files then hold the depth, with geometric mean 1, and meshes the points")  # fmt: skip

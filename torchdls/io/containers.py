@@ -32,11 +32,12 @@ def read_npy(path: Path) -> Array:
 
 def _read_array(file: IO[bytes], size: int) -> Array:
     """One array in the NPY format out of `size` bytes; its header is believed only as far as they reach."""
-    version = npy.read_magic(file)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"version {version[0]}.{version[1]} of the format is not for plain arrays")
-    read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, column_major, dtype = read_header(file)
+    try:
+        version = npy.read_magic(file)
+        read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
+        shape, column_major, dtype = read_header(file)
+    except Exception:  # the parser of Python reads it, and has many words for what it is not
+        raise ValueError("its header is damaged") from None
     if dtype.kind not in "bfiu":
         raise ValueError(f"its entries are {dtype}, numbers are needed")
     count, left = math.prod(shape), size - file.tell()

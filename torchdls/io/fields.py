@@ -139,7 +139,8 @@ def _field_of_array(
     if not codes:
         channels = channels.astype(np.float64 if array.dtype.itemsize >= 8 else np.float32)
     try:
-        found = unpack(channels, packing)
+        with np.errstate(all="ignore"):  # numbers near the end of their range are no lengths of 1
+            found = unpack(channels, packing)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     n = found.normals.astype(np.float32) if codes else found.normals

@@ -53,7 +53,7 @@ def read_file(path: Path, suffixes: Sequence[str]) -> Array | Mapping[str, Array
         head = file.read(26)
     form = suffix[1:].upper()
     if not head or not head.startswith(SIGNATURES[suffix]):
-        raise ValueError(f"{path}: not a {form} file")
+        raise ValueError(f"{path}: no {form} file, whatever its name")
     with naming(path, form):
         if suffix == ".npy":
             return read_npy(path)
@@ -154,9 +154,8 @@ def _read_exr(path: Path) -> Array:
     """The normals of an OpenEXR file (H, W, 3), or with its alpha (H, W, 4)."""
     exr: Any = require("OpenEXR", "files")
     with exr.File(str(path), header_only=True) as file:
-        header = file.header()
-    names = [channel.name for channel in header["channels"]]
-    low, high = header["dataWindow"]
+        names = [channel.name for channel in file.header()["channels"]]
+        low, high = file.header()["dataWindow"]
     width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
     check_declared(4 * len(names) * width * height, os.path.getsize(path))
     chosen = _exr_layer(names)
@@ -182,7 +181,7 @@ def _exr_layer(names: Sequence[str]) -> list[str]:
     named = [entry for entry in found if "normal" in entry[0].lower()] or found
     if len(named) == 1:
         layer, channels = named[0]
-        return channels + [layers[layer]["A"]] * ("A" in layers[layer])
+        return channels + ([layers[layer]["A"]] if "A" in layers[layer] else [])
     if not named and set(names) == {"Y"}:
         return ["Y"]
     several = "several layers" if named else "no layer"

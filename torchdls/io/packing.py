@@ -16,7 +16,7 @@ With an `a` at the end (`rgba`, `rgza`, `rga`, `xyza`) alpha is the mask; otherw
 one whose vectors have length 1 most nearly (median of | |n| - 1 |) is taken, the more usual one unless another is
 twice as good; it must come within `FITS` and most normals must not lie at grazing angle. Where blue says nothing of
 z (it does not follow sqrt(1 - x^2 - y^2)) or none of them fits, `rg` and `ag` are tried: x^2 + y^2 <= 1 must
-hold. A map that fits none is an error. Alpha is a mask where it is almost everywhere 0 or 1.
+hold, and one of them vary. A map that fits none is an error. Alpha is a mask where it is almost everywhere 0 or 1.
 """
 
 from __future__ import annotations
@@ -160,7 +160,8 @@ def _find(channels: Array, candidates: list[Array]) -> tuple[str, Array]:
             return name, candidates[0] if name == "xyz" else candidates[-1]
     if packed:
         for name in ("ag", "rg") if _alpha_is_x(last) else ("rg",):
-            if np.isfinite(_DECODE[name](last)[:, 2]).mean() > 0.95:
+            n = _DECODE[name](last)
+            if np.isfinite(n[:, 2]).mean() > 0.95 and max(_spread(n[:, 0]), _spread(n[:, 1])) > 0.02:
                 return name, candidates[-1]
     raise ValueError("the vectors have length 1 in none of the packings rgb, rgz, rg, ag" + _tell(misfit))
 

@@ -13,7 +13,7 @@ from torchdls import LeastSquares, gradient_to_normals, io, normals_to_gradient,
 from torchdls.cli.main import main
 from torchdls.surfaces import SURFACES
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def surface(n=32):
