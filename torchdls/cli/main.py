@@ -64,7 +64,8 @@ def _complain(error: Exception) -> int:
         message = f"{error.filename or 'standard output'}: {error.strerror}"
     else:
         message = " ".join(str(error).split()) or type(error).__name__
-    print(f"torchdls: error: {message}", file=sys.stderr)
+    message = "".join(c if c.isprintable() else "?" for c in message)
+    print(f"torchdls: error: {message if len(message) < 1000 else message[:1000] + ' ...'}", file=sys.stderr)
     return 2
 
 

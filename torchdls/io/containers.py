@@ -1,4 +1,4 @@
-"""Arrays in NPY, NPZ and MAT files, read one at a time and never larger than the file can hold."""
+"""Arrays in NPY and NPZ files, read one at a time and never larger than the file can hold."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import os
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 from numpy.lib import format as npy
 
-from torchdls._files import Array, naming, require
+from torchdls._files import Array, naming
 
 # No compression that is read here makes less than a byte of 1,100 (deflate: 1,032); below 64 MB any claim is harmless.
 RATIO, HARMLESS = 1100, 2**26
@@ -64,6 +64,9 @@ class Archive(Mapping[str, Array]):
         with naming(self._path, f"{self._form}, {name}"):
             return self._read(name)
 
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
 
@@ -90,20 +93,3 @@ def open_npz(path: Path) -> Archive:
                 return array
 
     return Archive(path, "NPZ", list(members), read)
-
-
-def open_mat(path: Path) -> Archive:
-    """The numeric arrays of a MAT file, version 5."""
-    scipy_io: Any = require("scipy.io", "files")
-    try:
-        found = scipy_io.whosmat(path, appendmat=False)
-    except RuntimeError:  # what scipy says of HDF5
-        raise ValueError("it is a MAT file of version 7.3; store it with save(..., '-v7')") from None
-    numeric = {"double": 8, "single": 4, "uint8": 1, "uint16": 2, "logical": 1}
-    sizes = {name: math.prod(shape) * numeric[kind] for name, shape, kind in found if kind in numeric}
-
-    def read(name: str) -> Array:
-        check_declared(sizes[name], os.path.getsize(path))
-        return np.asarray(scipy_io.loadmat(path, appendmat=False, variable_names=[name])[name])
-
-    return Archive(path, "MAT", list(sizes), read)

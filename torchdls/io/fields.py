@@ -18,7 +18,7 @@ r"""Files: normal maps, gradients and masks in; heights and meshes out, whole or
 
 Outside the mask files hold NaN. A file is written beside its place and moved there when it is complete; what exists is
 replaced only with `overwrite=True`. Of an NPZ or a MAT file only the arrays that are needed are unpacked, and no header
-is believed that declares more than the file can hold. TIFF, EXR, MAT and meshes need `pip install 'torchdls[files]'`.
+is believed that declares more than the file can hold. TIFF, EXR and meshes need `pip install 'torchdls[files]'`.
 """  # noqa: E501 (a row of a table is one line)
 
 from __future__ import annotations

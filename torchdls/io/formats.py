@@ -9,14 +9,16 @@ import stat
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchdls._files import Array, naming, require
-from torchdls.io.containers import RATIO, check_declared, open_mat, open_npz, read_npy
+from torchdls.io.containers import RATIO, check_declared, open_npz, read_npy
+from torchdls.io.matlab import open_mat
 
 _JPEG, _TIFF = (b"\xff\xd8",), (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 SIGNATURES: dict[str, tuple[bytes, ...]] = {
@@ -150,16 +152,35 @@ def _silent(name: str) -> Iterator[None]:
         logger.setLevel(level)
 
 
+@contextmanager
+def _mute() -> Iterator[None]:
+    """Nothing of what OpenEXR prints about damage, past Python, before it raises."""
+    with redirect_stdout(StringIO()), open(os.devnull, "wb") as nothing:
+        try:
+            error_output = os.dup(2)
+        except OSError:  # there is none
+            yield
+            return
+        try:
+            os.dup2(nothing.fileno(), 2)
+            yield
+        finally:
+            os.dup2(error_output, 2)
+            os.close(error_output)
+
+
 def _read_exr(path: Path) -> Array:
     """The normals of an OpenEXR file (H, W, 3), or with its alpha (H, W, 4)."""
     exr: Any = require("OpenEXR", "files")
-    with exr.File(str(path), header_only=True) as file:
+    with _mute(), exr.File(str(path), header_only=True) as file:
         names = [channel.name for channel in file.header()["channels"]]
         low, high = file.header()["dataWindow"]
     width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
     check_declared(4 * len(names) * width * height, os.path.getsize(path))
     chosen = _exr_layer(names)
-    with exr.File(str(path), separate_channels=True) as file:
+    with _mute(), exr.File(str(path), separate_channels=True) as file:
+        if not file.parts:
+            raise ValueError("its content is damaged")
         planes = [np.asarray(file.channels()[name].pixels, np.float32) for name in chosen]
     if len({plane.shape for plane in planes}) > 1:
         raise ValueError("its channels differ in size")
