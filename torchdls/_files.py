@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import secrets
-from collections.abc import Iterator, Sequence
+import stat
+import struct
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
@@ -16,16 +20,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 Array = NDArray[Any]
-SIGNATURES: dict[str, tuple[bytes, ...]] = {
-    ".png": (b"\x89PNG\r\n\x1a\n",),
-    ".jpg": (b"\xff\xd8",),
-    ".jpeg": (b"\xff\xd8",),
-    ".tif": (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),
-    ".tiff": (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),
-    ".npy": (b"\x93NUMPY",),
-    ".npz": (b"PK",),
-}
 
 
 def check_output(
@@ -41,9 +41,10 @@ def check_output(
     path = Path(path)
     if suffixes is not None and path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: unknown format {path.suffix!r}, choose from {', '.join(suffixes)}")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: the directory {path.parent} does not exist")
-    if path.is_dir() or (path.exists() and not overwrite):
+    parent = Path(os.path.realpath(path)).parent if path.is_symlink() and overwrite else path.parent
+    if not parent.is_dir():
+        raise FileNotFoundError(f"{path}: the directory {parent} does not exist")
+    if path.is_dir() or (os.path.lexists(path) and not overwrite):
         raise FileExistsError(f"{path}: exists already; overwrite=True (--force on the command line) replaces a file")
     return path
 
@@ -52,73 +53,124 @@ def check_output(
 def atomic_file(path: str | os.PathLike[str], overwrite: bool = False) -> Iterator[BinaryIO]:
     """A binary file that takes its place when the block ends without an error, and else leaves no trace.
 
+    What replaces a file keeps its permissions, and a symbolic link goes on pointing to it. Of several writers without
+    `overwrite` exactly one succeeds. A draft that a killed writer left is removed by the next write to the same name.
+
     Raises:
         FileNotFoundError: the directory does not exist.
         FileExistsError: the file exists and `overwrite` is False.
+        OSError: writing fails; it names the path.
     """
     path = check_output(path, overwrite)
-    draft = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
+    place = Path(os.path.realpath(path)) if overwrite else path
     try:
-        with open(draft, "xb") as file:
+        _sweep(place)
+        file = _draft(place)
+    except OSError as error:
+        raise _naming_output(path, error) from error
+    try:
+        with file:
             yield file
-        check_output(path, overwrite)  # it may have come into being meanwhile
-        os.replace(draft, path)
-    except BaseException:
-        with suppress(OSError):
-            draft.unlink()
+            file.flush()
+            if overwrite and place.exists():
+                os.chmod(file.name, stat.S_IMODE(os.stat(place).st_mode))
+            if fcntl is None:
+                file.close()  # an open file cannot be moved there
+            _publish(Path(file.name), place, overwrite)
+    except FileExistsError:
+        _remove(file.name)
+        check_output(path, overwrite)  # says it in its own words
         raise
+    except BaseException as error:
+        _remove(file.name)
+        failure = _failed_write(error)
+        if failure is None:
+            raise
+        raise _naming_output(path, failure) from error
 
 
-def read_file(path: Path, suffixes: Sequence[str]) -> Array | dict[str, Array]:
-    """The raw array of a file, images as (H, W) or (H, W, C); all the arrays of an NPZ."""
-    suffix = path.suffix.lower()
-    if suffix not in suffixes:
-        raise ValueError(f"{path}: unknown format {suffix!r}, choose from {', '.join(suffixes)}")
-    with open(path, "rb") as file:
-        head = file.read(26)
-    if not head.startswith(SIGNATURES[suffix]):
-        raise ValueError(f"{path}: not a {suffix[1:].upper()} file")
-    tifffile = require("tifffile", "files") if suffix in (".tif", ".tiff") else None
-    with naming(path, suffix[1:].upper()):
-        if tifffile is not None:
-            return np.asarray(tifffile.imread(path))
-        if suffix in (".npy", ".npz"):
-            with open(path, "rb") as file:  # NumPy leaves a damaged archive open
-                loaded = np.load(file, allow_pickle=False)
-                return loaded if suffix == ".npy" else {name: loaded[name] for name in loaded.files}
-        return _read_image(path, head)
+def _draft(place: Path) -> BinaryIO:
+    """A new file beside its place, locked while its writer lives."""
+    while True:
+        name = place.with_name(f".{place.name}.{secrets.token_hex(4)}.draft")
+        file = open(name, "xb")  # noqa: SIM115 (the caller closes it)
+        if fcntl is None:
+            return file
+        with suppress(OSError):  # a file system without locks: nobody can sweep there either
+            fcntl.flock(file, fcntl.LOCK_EX)
+        if os.path.exists(file.name):  # nobody swept it up before it was locked
+            return file
+        file.close()
 
 
-def _read_image(path: Path, head: bytes) -> Array:
-    # kornia keeps the 16 bits that imageio, scikit-image and Pillow drop from colours. Palettes, gray with alpha and
-    # fewer than 8 bits it cannot decode: those are left to Pillow, which is exact for them.
-    depth, color = (head[24], head[25]) if path.suffix.lower() == ".png" else (8, 2)
-    if depth >= 8 and color in (0, 2, 6):
-        from kornia.io import ImageLoadType, load_image
+def _sweep(place: Path) -> None:
+    """Remove the drafts of this name whose writers are dead: nobody holds their locks."""
+    for draft in place.parent.glob(f".{glob.escape(place.name)}.{'[0-9a-f]' * 8}.draft"):
+        with suppress(OSError):
+            if fcntl is None:
+                draft.unlink()  # refused while it is open
+                continue
+            with open(draft, "rb") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                draft.unlink()
 
-        return np.asarray(load_image(path, ImageLoadType.UNCHANGED).permute(1, 2, 0).numpy())
-    if depth == 16:
-        raise ValueError("16-bit gray with alpha is not supported; store gray or RGBA")
-    from PIL import Image
 
-    with Image.open(path) as image:
-        mode = {0: "L", 3: "RGBA" if "transparency" in image.info else "RGB", 4: "LA"}[color]
-        pixels = np.asarray(image.convert(mode))
-    return pixels if pixels.ndim == 3 else pixels[..., None]
+def _publish(draft: Path, place: Path, overwrite: bool) -> None:
+    """Move a finished draft to its place; FileExistsError if there is a file that must not be replaced."""
+    if not overwrite:
+        try:
+            os.link(draft, place)
+        except FileExistsError:
+            raise
+        except OSError:  # no hard links on this file system: claim the name instead
+            os.close(os.open(place, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        else:
+            return draft.unlink()
+    os.replace(draft, place)
+    return None
+
+
+def _remove(name: str) -> None:
+    with suppress(OSError):
+        os.unlink(name)
+
+
+def _failed_write(error: BaseException | None) -> OSError | None:
+    """The failure of the system behind an error; archives that cannot be closed after it hide it."""
+    while error is not None and not isinstance(error, OSError):
+        error = error.__context__ if isinstance(error, Exception) else None
+    return error
+
+
+def _naming_output(path: Path, error: OSError) -> OSError:
+    if error.errno is None:
+        return OSError(f"{path}: cannot be written whole: {error}")
+    return OSError(error.errno, error.strerror, str(path))
 
 
 @contextmanager
 def naming(path: Path, form: str) -> Iterator[None]:
     """Every complaint of a decoder about the content becomes one ValueError that names the file."""
     try:
-        yield
-    except (FileNotFoundError, PermissionError, IsADirectoryError, MemoryError):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except (FileNotFoundError, PermissionError, IsADirectoryError, ImportError):
         raise
     except Exception as error:
-        reason = str(error).strip().splitlines()
-        raise ValueError(
-            f"{path}: cannot be read as {form}: {reason[0] if reason else type(error).__name__}"
-        ) from error
+        raise ValueError(f"{path}: cannot be read as {form}: {_reason(path, error)}") from error
+
+
+def _reason(path: Path, error: Exception) -> str:
+    """What a decoder says, where it speaks to the reader and not to the programmer."""
+    if isinstance(error, MemoryError):
+        return "there is not enough memory"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    stumbled = (LookupError, AttributeError, AssertionError, TypeError, ArithmeticError, UnicodeError, struct.error)
+    reason = next(iter(str(error).strip().splitlines()), "")
+    foreign = not reason.isprintable() or str(path) in reason or "b'" in reason
+    return "its content is damaged" if isinstance(error, stumbled) or foreign or not reason else reason
 
 
 def require(name: str, extra: str) -> ModuleType:
@@ -128,7 +180,7 @@ def require(name: str, extra: str) -> ModuleType:
         raise ImportError(f"{name} is not installed: pip install 'torchdls[{extra}]'") from error
 
 
-def one_of(path: Path, content: dict[str, Array], names: Sequence[str]) -> str:
+def one_of(path: Path, content: Mapping[str, Any], names: Sequence[str]) -> str:
     for name in names:
         if name in content:
             return name

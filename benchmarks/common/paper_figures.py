@@ -15,7 +15,7 @@ from torch import Tensor
 
 import torchdls
 from torchdls import INTEGRATORS, SURFACES, add_noise
-from torchdls._files import read_file
+from torchdls.io.formats import read_file
 from torchdls.plot import hillshade
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchdls._registry import INTEGRATORS
-from torchdls.cli.methods import build_method, run_method
+from torchdls.cli.methods import build_method, check_method, run_method
+from torchdls.cli.reading import Reading, read_normals
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -26,18 +27,20 @@ def add_integrate(commands: Any) -> None:
     command = commands.add_parser(
         "integrate",
         help="a normal map or a gradient to a surface",
-        description="Integrate a normal map (PNG, JPEG, TIFF, NPY, NPZ) or a gradient (NPZ, NPY, TIFF) to a surface.",
+        description="Integrate a normal map (a picture or an array) or a gradient (NPZ, NPY, MAT, TIFF) to a surface.",
     )
     add = command.add_argument
-    add("input", metavar="INPUT", help="normal map: 8/16-bit PNG, JPEG or TIFF; arrays: NPY, or NPZ with `gradient` or "
-        "`normals` and optionally `mask`, `weight`, `pixel_size`")  # fmt: skip
+    add("input", metavar="INPUT", help="normal map: PNG, JPEG, TIFF, EXR, BMP, TGA or WebP; arrays: NPY, or NPZ or MAT "
+        "with `gradient` or `normals` and optionally `mask`, `weight`, `pixel_size`")  # fmt: skip
     add("-o", "--out", action="append", required=True, metavar="OUT",
         help="NPZ, NPY, TIFF (32-bit), PNG (16-bit), PLY, OBJ, STL or GLB; may be repeated")  # fmt: skip
     add("--method", default=_METHOD, help=f"{', '.join(INTEGRATORS)} (default: {_METHOD})")
     add("--set", action="append", default=[], metavar="NAME=VALUE", help="option of the method, such as lam=0.5")
     add("--mask", metavar="FILE", help="image or array; white or nonzero is valid")
-    add("--convention", help="normals: opengl (default), directx, opencv, kornia, matlab; "
-        "gradients: image (default: right, down), cartesian (right, up), depth, matlab (down, right)")  # fmt: skip
+    add("--channels", metavar="PACKING", help="how the normals are packed, if it is not found right: rgb, rgz, rg, ag "
+        "(x in alpha) or xyz (signed); with an a at the end, as in rgba, alpha is the mask")  # fmt: skip
+    add("--convention", help="normals: opengl (default), directx, opencv, kornia, matlab, or auto (the most "
+        "integrable); gradients: image (default: right, down), cartesian (right, up), depth, matlab")  # fmt: skip
     add("--pixel-size", type=float, nargs="+", metavar="D", help="spacing of the pixels, or of columns and rows")
     add("--camera", metavar="K", help="intrinsics, 3 x 3 in NPY, NPZ or text, or FX,FY,CX,CY in pixels: undo the "
         "perspective; files then hold the depth, with geometric mean 1, and meshes the points")  # fmt: skip
@@ -52,19 +55,25 @@ def _integrate(arguments: argparse.Namespace) -> None:
 
     from torchdls import io
     from torchdls._files import check_output
+    from torchdls.io.packing import describe
 
-    for path in arguments.out:  # what would fail after the work shall fail before it
+    check_method(arguments.method, arguments.set)  # what would fail after the work shall fail before it
+    for path in arguments.out:
         check_output(path, arguments.force, suffixes=io.OUTPUT_SUFFIXES)
     camera = None if arguments.camera is None else _camera(arguments.camera)
-    field = io.load_field(arguments.input)
+    field = io.load_field(arguments.input, packing=arguments.channels)
     if field.values.shape[0] != 1:
         raise ValueError(f"{arguments.input}: holds {field.values.shape[0]} surfaces, one is needed")
     pixel_size = _pixel_size(arguments.pixel_size, field.pixel_size, camera)
     dtype = torch.float64 if arguments.float64 else field.values.dtype
     field = field._replace(values=field.values.to(dtype), mask=_joint_mask(arguments, field))
-    gradient, mask = _gradient(arguments, field, camera)
+    reading = _gradient(arguments, field, camera)
+    gradient, mask = reading.gradient, None if reading.mask.all() else reading.mask
     method = build_method(arguments.method, pixel_size, arguments.set)
     weight = None if field.weight is None else field.weight.to(dtype)
+    for note in reading.notes:
+        if not arguments.quiet or "warning" in note:
+            print(note, file=sys.stderr)
     start = time.perf_counter()
     with torch.no_grad():
         height, noise = run_method(arguments.method, method, arguments.quiet, gradient, mask=mask, weight=weight)
@@ -72,6 +81,8 @@ def _integrate(arguments: argparse.Namespace) -> None:
     for path in arguments.out:
         _save(path, height, mask, gradient, pixel_size, camera, arguments.force)
     if not arguments.quiet:
+        if field.kind == "normals":
+            print(f"{arguments.input}: read as {describe(field.packing)}, convention {reading.convention}")
         h, w = height.shape[-2:]
         pixels = f"{int(mask.sum())} of {h * w} pixels" if mask is not None else f"{h} x {w} pixels"
         level = "" if noise is None else f", noise {float(noise):.3g} in the slopes,"
@@ -98,7 +109,7 @@ def _camera(text: str) -> Tensor:
     from torchdls import io
 
     parts = text.split(",")
-    if len(parts) != 4 or Path(text).exists():
+    if len(parts) == 1 or Path(text).exists():
         return io.load_camera(text)
     try:
         fx, fy, cx, cy = map(float, parts)
@@ -120,30 +131,24 @@ def _joint_mask(arguments: argparse.Namespace, field: Field) -> Tensor | None:
     return mask if field.mask is None else mask & field.mask
 
 
-def _gradient(arguments: argparse.Namespace, field: Field, camera: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Gradient in the library's convention, and the mask of its valid pixels (None if all are)."""
-    from torchdls.geometry import GRADIENT_CONVENTIONS, NORMAL_CONVENTIONS, convert_gradient, normals_to_gradient
+def _gradient(arguments: argparse.Namespace, field: Field, camera: Tensor | None) -> Reading:
+    """Gradient in the library's convention, and the mask of its valid pixels."""
+    from torchdls.geometry import GRADIENT_CONVENTIONS, convert_gradient
 
-    normals = field.kind == "normals"
-    known = NORMAL_CONVENTIONS if normals else GRADIENT_CONVENTIONS
-    convention = arguments.convention or next(iter(known))
-    if convention not in known:
-        raise ValueError(f"--convention: {convention!r} is not for {field.kind}; choose from {', '.join(known)}")
-    if normals:
-        gradient, mask, invalid = normals_to_gradient(field.values, convention, mask=field.mask, camera=camera)
-        if invalid.any() and not arguments.quiet:
-            print(f"{arguments.input}: {int(invalid)} pixels without a valid normal are left out", file=sys.stderr)
-        if not mask.any():
-            raise ValueError(f"{arguments.input}: no valid normal under convention {convention!r}")
-    else:
-        if camera is not None:
-            raise ValueError("--camera: needs a normal map, but the input is a gradient")
-        gradient = convert_gradient(field.values, convention)
-        finite = gradient.isfinite().all(1, keepdim=True)
-        mask = finite if field.mask is None else finite & field.mask
-        if not mask.any():
-            raise ValueError(f"{arguments.input}: no finite slope inside the mask")
-    return gradient, None if mask.all() else mask
+    if field.kind == "normals":
+        return read_normals(arguments.input, field, arguments.convention, camera)
+    convention = arguments.convention or next(iter(GRADIENT_CONVENTIONS))
+    if convention not in GRADIENT_CONVENTIONS:
+        known = ", ".join(GRADIENT_CONVENTIONS)
+        raise ValueError(f"--convention: {convention!r} is not for gradient; choose from {known}")
+    if camera is not None:
+        raise ValueError("--camera: needs a normal map, but the input is a gradient")
+    gradient = convert_gradient(field.values, convention)
+    finite = gradient.isfinite().all(1, keepdim=True)
+    mask = finite if field.mask is None else finite & field.mask
+    if not mask.any():
+        raise ValueError(f"{arguments.input}: no finite slope inside the mask")
+    return Reading(gradient, mask, convention, ())
 
 
 def _save(

@@ -38,8 +38,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
             arguments.run(arguments)
+        sys.stdout.flush()
     except (ValueError, TypeError, OSError, ImportError) as error:
         return _complain(error)
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, MemoryError) or "allocate memory" in str(error):
+            return _complain(OSError("there is not enough memory for an input of this size"))
+        raise
     except KeyboardInterrupt:
         print("torchdls: interrupted", file=sys.stderr)
         return 130
@@ -55,11 +60,12 @@ def _complain(error: Exception) -> int:
     if isinstance(error, BrokenPipeError):  # the reader of our output went away, as in `torchdls methods | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    if isinstance(error, OSError) and error.filename is not None:
-        message = f"{error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror:
+        message = f"{error.filename or 'standard output'}: {error.strerror}"
     else:
         message = " ".join(str(error).split()) or type(error).__name__
-    print(f"torchdls: error: {message}", file=sys.stderr)
+    message = "".join(c if c.isprintable() else "?" for c in message)
+    print(f"torchdls: error: {message if len(message) < 1000 else message[:1000] + ' ...'}", file=sys.stderr)
     return 2
 
 

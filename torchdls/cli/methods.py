@@ -28,20 +28,60 @@ def list_methods(arguments: argparse.Namespace) -> None:
         print(textwrap.fill(options, 110, initial_indent=indent, subsequent_indent=indent))
 
 
-def build_method(name: str, pixel_size: tuple[float, float], settings: Sequence[str] = ()) -> Integrator:
-    """The integrator of that name, with options given as words `name=value`."""
+def check_method(name: str, settings: Sequence[str] = ()) -> None:
+    """ValueError, in the words of the command line, for a method or options that cannot be used."""
     if name not in INTEGRATORS:
         raise ValueError(f"--method: {name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
-    options: dict[str, Any] = {"pixel_size": pixel_size}
+    known = {key: default for key, default in INTEGRATORS.parameters(name).items() if key != "pixel_size"}
+    for key, value in _options(settings).items():
+        if key == "pixel_size":
+            raise ValueError("--set: pixel_size has an option of its own, --pixel-size")
+        if key not in known:
+            options = ", ".join(f"{option}={_word(default)}" for option, default in known.items()) or "none"
+            raise ValueError(f"--set: {name} has no option {key!r}; its options and their defaults: {options}")
+        _check_option(name, key, value, known[key])
+
+
+def _check_option(name: str, key: str, value: Any, default: Any) -> None:
+    """One option by itself: a number for a number, and else what the method itself says."""
+    given = f"--set: {key}={_word(value)} given"
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if isinstance(default, bool) and not isinstance(value, bool):
+        raise ValueError(f"{given}, True or False is needed")
+    numeric = isinstance(default, (int, float)) and not isinstance(default, bool)
+    if numeric and not number and not isinstance(value, tuple):  # a pair, where one number stands for both
+        raise ValueError(f"{given}, a number is needed (default: {default})")
+    try:
+        INTEGRATORS[name](**{key: value})
+    except ValueError:
+        pass  # together with the other options it may be right; if not, that is said when the method is built
+    except Exception as error:
+        raise ValueError(f"{given}, which is not usable (default: {_word(default)})") from error
+
+
+def _word(value: Any) -> str:
+    """A value as one writes it after --set."""
+    return value if isinstance(value, str) else repr(value)
+
+
+def _options(settings: Sequence[str]) -> dict[str, Any]:
+    """The values of words `name=value`: numbers, True, False, None, pairs, or plain words such as z_step=proximal."""
+    options: dict[str, Any] = {}
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not equals or not key.isidentifier():
             raise ValueError(f"--set: {setting!r} given, NAME=VALUE is needed")
         try:
             options[key] = ast.literal_eval(value)
-        except (ValueError, SyntaxError):
-            options[key] = value  # a plain word such as z_step=proximal
-    return INTEGRATORS[name](**options)
+        except (ValueError, SyntaxError, MemoryError, RecursionError):
+            options[key] = value
+    return options
+
+
+def build_method(name: str, pixel_size: tuple[float, float], settings: Sequence[str] = ()) -> Integrator:
+    """The integrator of that name, with options given as words `name=value`."""
+    check_method(name, settings)
+    return INTEGRATORS[name](pixel_size=pixel_size, **_options(settings))
 
 
 @contextmanager

@@ -221,14 +221,21 @@ class GradientToNormals(_Conversion):
 
 
 def guess_convention(
-    normals: Tensor, mask: Tensor | None = None, candidates: Sequence[str] = ("opengl", "directx")
+    normals: Tensor,
+    mask: Tensor | None = None,
+    candidates: Sequence[str] = ("opengl", "directx"),
+    *,
+    camera: Tensor | None = None,
 ) -> ConventionGuess:
     r"""Which convention makes the normals most nearly those of a surface.
 
     Second derivatives commute, so each reading is scored by the curl of its gradient over complete 2x2 cells,
     relative to the two terms that should cancel, the whole batch together:
 
-        residual = sum |D_x g_y - D_y g_x| / sum (|D_x g_y| + |D_y g_x|)
+        residual = sum |D_x g_y - D_y g_x| / max over the candidates of sum (|D_x g_y| + |D_y g_x|)
+
+    The scale is one for all candidates: where the terms themselves are small (z_xy near 0, as at the top of a sphere),
+    their ratio is noise, and the curl alone tells.
 
     This tells OpenGL from DirectX as far as the surface is twisted (z_xy is not 0); residuals close to each other mean
     that the data does not tell. Readings that differ by the sign of the height alone can never be told apart.
@@ -237,20 +244,22 @@ def guess_convention(
         normals: (N, 3, H, W) or (3, H, W).
         mask: (N, 1, H, W) bool; default: all pixels.
         candidates: conventions to compare.
+        camera: intrinsics K, as in `normals_to_gradient`.
 
     Raises as `normals_to_gradient` does, and ValueError if no candidate has a complete 2x2 cell of valid pixels.
     """
-    residual = {}
+    curl, scale = {}, 0.0
     for name in candidates:
-        field = normals_to_gradient(normals.detach(), name, mask=mask)
+        field = normals_to_gradient(normals.detach(), name, mask=mask, camera=camera)
         pairs = field.mask[..., 1:] & field.mask[..., :-1]
         cells = pairs[..., 1:, :] & pairs[..., :-1, :]
         gx, gy = field.gradient.split(1, -3)
         slope_y, slope_x = (gy[..., 1:, :] + gy[..., :-1, :]) / 2, (gx[..., 1:] + gx[..., :-1]) / 2
         a, b = slope_y.diff(dim=-1) * cells, slope_x.diff(dim=-2) * cells
-        total = float((a.abs() + b.abs()).sum())
         # A plane is a surface in every reading; a reading without any cell is none.
-        residual[name] = float((a - b).abs().sum()) / total if total else 0.0 if cells.any() else float("inf")
+        curl[name] = float((a - b).abs().sum()) if cells.any() else float("inf")
+        scale = max(scale, float((a.abs() + b.abs()).sum()))
+    residual = {name: value / (scale or 1.0) for name, value in curl.items()}
     if not residual or min(residual.values()) == float("inf"):
         raise ValueError(f"normals: no 2x2 cell of valid pixels in any of the conventions {', '.join(candidates)}")
     return ConventionGuess(min(residual, key=residual.__getitem__), residual)

@@ -2,11 +2,11 @@ r"""Files: normal maps, gradients and masks in; heights and meshes out, whole or
 
 | read        | content                                                                                         |
 |-------------|-------------------------------------------------------------------------------------------------|
-| PNG, JPEG, TIFF | normal map, 3 or 4 channels: n = 2c - 1 with c = code/255 or code/65535; alpha is the mask   |
-| TIFF of floats  | gradient (2 channels) or normals (3), in [0, 1] if so they are of unit length, else in [-1, 1]   |
-| NPY         | normals (3, H, W) or gradient (2, H, W); channels last and a batch in front are understood        |
-| NPZ         | `normals` or `gradient` as above; optional `mask` (H, W), `weight` (H, W) or (2, H, W), `pixel_size` |
-| mask        | PNG, JPEG, TIFF: white (at least half) is valid; NPY, NPZ (`mask`): nonzero is valid               |
+| PNG, JPEG, TIFF, BMP, TGA, WebP | normal map of 8 or 16 bits, packed in one of the ways of `torchdls.io.packing` |
+| TIFF or EXR of floats | gradient (2 channels) or normals (3 or 4, packed in any of those ways)                  |
+| NPY         | normals (3 or 4, H, W) or gradient (2, H, W); channels last and a batch in front are understood   |
+| NPZ, MAT    | `normals` or `gradient` as above; optional `mask` (H, W), `weight` (H, W) or (2, H, W), `pixel_size`; of a MAT file without them its only array (H, W, 3) or (H, W, 2) |
+| mask        | pictures: white (at least half) is valid; NPY, NPZ, MAT (`mask`): nonzero is valid               |
 
 | written     | content                                                                                         |
 |-------------|-------------------------------------------------------------------------------------------------|
@@ -17,12 +17,14 @@ r"""Files: normal maps, gradients and masks in; heights and meshes out, whole or
 | PLY, OBJ, STL, GLB | triangles between valid pixels; x right, y up, z to the viewer                           |
 
 Outside the mask files hold NaN. A file is written beside its place and moved there when it is complete; what exists is
-replaced only with `overwrite=True`. TIFF and meshes need `pip install 'torchdls[files]'`.
-"""
+replaced only with `overwrite=True`. Of an NPZ or a MAT file only the arrays that are needed are unpacked, and no header
+is believed that declares more than the file can hold. TIFF, EXR and meshes need `pip install 'torchdls[files]'`.
+"""  # noqa: E501 (a row of a table is one line)
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,15 +32,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchdls._files import (
-    SIGNATURES,
-    Array,
-    as_tensor,
-    naming,
-    one_of,
-    pair,
-    read_file,
-)
+from torchdls._files import Array, as_tensor, naming, one_of, pair
+from torchdls.io.formats import ARRAYS, SIGNATURES, read_file
+from torchdls.io.packing import unpack
 
 
 class Field(NamedTuple):
@@ -50,6 +46,7 @@ class Field(NamedTuple):
         mask: (N, 1, H, W) bool, or None.
         weight: (N, 1, H, W) or (N, 2, H, W), or None.
         pixel_size: (dx, dy), or None.
+        packing: how the normals were packed, one of `torchdls.io.packing.CHANNELS`; "" for a gradient.
     """
 
     kind: str
@@ -57,30 +54,31 @@ class Field(NamedTuple):
     mask: Tensor | None = None
     weight: Tensor | None = None
     pixel_size: tuple[float, float] | None = None
+    packing: str = ""
 
 
-def load_field(path: str | os.PathLike[str]) -> Field:
+def load_field(path: str | os.PathLike[str], packing: str | None = None) -> Field:
     """Read a normal map or a gradient; formats in the table at the top of this module.
 
-    Integer codes become float32 and are renormalised. Codes whose vector is shorter than 0.1 or longer than 1.5 are no
-    normals but black, gray or white background: they come back as zero vectors, which `normals_to_gradient` reports.
+    How the components are packed is found from the lengths of the vectors, by the rule of `torchdls.io.packing`, and
+    said in `Field.packing`. Codes become float32 and are renormalised; those that are no normals but black, gray or
+    white background come back as zero vectors, which `normals_to_gradient` reports. Floats with signs stay as they are.
+
+    Args:
+        path: the file.
+        packing: one of `torchdls.io.packing.CHANNELS`, to say it; also makes normals of two channels of floats.
 
     Raises:
         OSError: the file cannot be opened.
-        ValueError: the file is damaged, or does not hold a normal map or a gradient.
+        ValueError: the file is damaged, does not hold a normal map or a gradient, or the lengths of its vectors fit no
+            packing.
         ImportError: the library for this format is not installed.
     """
     path = Path(path)
     content = read_file(path, tuple(SIGNATURES))
-    if isinstance(content, dict):
-        return _field_of_npz(path, content)
-    if path.suffix.lower() == ".npy":
-        return _field_of_array(path, content)
-    if content.ndim == 3 and content.shape[-1] in (3, 4) and content.dtype.kind != "f":
-        return _field_of_codes(path, content)
-    if content.ndim == 3 and content.dtype.kind == "f":
-        return _field_of_array(path, content, last=True)
-    raise ValueError(f"{path}: shape {content.shape} of {content.dtype} is no normal map, three channels are needed")
+    if isinstance(content, Mapping):
+        return _field_of_archive(path, content, packing)
+    return _field_of_array(path, content, packing, last=path.suffix.lower() not in ARRAYS)
 
 
 def load_mask(path: str | os.PathLike[str]) -> Tensor:
@@ -90,28 +88,30 @@ def load_mask(path: str | os.PathLike[str]) -> Tensor:
     """
     path = Path(path)
     content = read_file(path, tuple(SIGNATURES))
-    if isinstance(content, dict):
+    if isinstance(content, Mapping):
         content = content[one_of(path, content, ("mask",))]
-    if content.ndim == 3 and path.suffix.lower() not in (".npy", ".npz"):
+    if content.ndim == 3 and _is_picture(path):
         content = content[..., : 1 if content.shape[-1] < 3 else 3].mean(-1, dtype=np.float64).astype(content.dtype)
     if content.ndim > 2:
         content = content.reshape(content.shape[-2:]) if content.size == np.prod(content.shape[-2:]) else content
     if content.ndim != 2 or not content.size:
         raise ValueError(f"{path}: shape {content.shape} is no mask, (H, W) is needed")
-    threshold = np.iinfo(content.dtype).max / 2 if _is_image(path) and content.dtype.kind == "u" else 0
+    threshold = np.iinfo(content.dtype).max / 2 if _is_picture(path) and content.dtype.kind == "u" else 0
     return torch.from_numpy((content > threshold) & np.isfinite(content))[None, None]
 
 
 def load_camera(path: str | os.PathLike[str]) -> Tensor:
-    """Read intrinsics K (3, 3) in float64 from NPY, NPZ (`camera` or `K`) or a text file of three rows.
+    """Read intrinsics K (3, 3) in float64 from NPY, NPZ or MAT (`camera` or `K`) or a text file of three rows.
 
     Raises: as `load_field`.
     """
     path = Path(path)
-    if path.suffix.lower() in (".npy", ".npz"):
-        content = read_file(path, (".npy", ".npz"))
-        matrix = content[one_of(path, content, ("camera", "K"))] if isinstance(content, dict) else content
+    if path.suffix.lower() in ARRAYS:
+        content = read_file(path, ARRAYS)
+        matrix = content[one_of(path, content, ("camera", "K"))] if isinstance(content, Mapping) else content
     else:
+        if path.is_file() and path.stat().st_size > 100_000:
+            raise ValueError(f"{path}: too long for a text of three rows")
         with naming(path, "text"):
             matrix = np.loadtxt(path, ndmin=2)
     if matrix.shape != (3, 3) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
@@ -120,49 +120,68 @@ def load_camera(path: str | os.PathLike[str]) -> Tensor:
     return torch.from_numpy(matrix.astype(np.float64))
 
 
-def _field_of_codes(path: Path, codes: Array) -> Field:
-    if codes.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{path}: {codes.dtype} codes given, 8 or 16 bits without sign are needed")
-    top = np.iinfo(codes.dtype).max
-    n = 2 * codes[..., :3].astype(np.float64) / top - 1
-    length = np.linalg.norm(n, axis=-1, keepdims=True)
-    n = np.where((length > 0.1) & (length < 1.5), n / np.maximum(length, 0.1), 0).astype(np.float32)
-    mask = torch.from_numpy(codes[..., 3] > top / 2)[None, None] if codes.shape[-1] == 4 else None
-    return Field("normals", as_tensor(np.moveaxis(n, -1, 0))[None], mask)
+def _field_of_array(
+    path: Path, array: Array, packing: str | None, last: bool = False, kind: str | None = None
+) -> Field:
+    """Normals or gradient, recognised by the number of channels; `last`: look for them last first."""
+    codes = array.dtype in (np.uint8, np.uint16)
+    normals = kind == "normals" or codes or packing is not None
+    numbers = {"gradient": [2], "normals": [2, 3, 4] if codes or packing else [3, 4]}.get(kind or "", [2, 3, 4])
+    groups = [{2, 3} & set(numbers), {4} & set(numbers)] if array.ndim in (3, 4) else []
+    axes = [axis for group in groups for axis in ((-1, -3) if last else (-3, -1)) if array.shape[axis] in group]
+    if not axes or not (codes or array.dtype.kind == "f") or not array.size or (codes and kind == "gradient"):
+        form = "8 or 16 bits without sign, or floats, with 3 channels for normals or 2 for a gradient are needed"
+        raise ValueError(f"{path}: {kind or 'array'} of {array.dtype} and shape {array.shape}; {form}")
+    if array.shape[axes[0]] == 2 and not normals:
+        values = as_tensor(np.moveaxis(array, axes[0], -3))
+        return Field("gradient", values if values.ndim == 4 else values[None])
+    channels = np.moveaxis(array, axes[0], -1)
+    if not codes:
+        channels = channels.astype(np.float64 if array.dtype.itemsize >= 8 else np.float32)
+    try:
+        with np.errstate(all="ignore"):  # numbers near the end of their range are no lengths of 1
+            found = unpack(channels, packing)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    n = found.normals.astype(np.float32) if codes else found.normals
+    values = as_tensor(np.moveaxis(n, -1, -3))
+    mask = None if found.mask is None else torch.from_numpy(np.ascontiguousarray(found.mask))[..., None, :, :]
+    if values.ndim == 3:
+        values, mask = values[None], None if mask is None else mask[None]
+    return Field("normals", values, mask, packing=found.packing)
 
 
-def _field_of_array(path: Path, array: Array, kind: str | None = None, last: bool = False) -> Field:
-    """Normals or gradient from floats, recognised by the number of channels; `last`: look for them last first."""
-    channels = {"normals": (3,), "gradient": (2,), None: (2, 3)}[kind]
-    axes = [axis for axis in ((-1, -3) if last else (-3, -1)) if array.ndim in (3, 4) and array.shape[axis] in channels]
-    if not axes or array.dtype.kind != "f" or not array.size:
-        wanted = "floats (3, H, W) of normals or (2, H, W) of a gradient are needed"
-        raise ValueError(f"{path}: {kind or 'array'} of {array.dtype} and shape {array.shape}, {wanted}")
-    values = as_tensor(np.moveaxis(array, axes[0], -3))
-    values = values if values.ndim == 4 else values[None]
-    if values.shape[1] == 2:
-        return Field("gradient", values)
-    lengths = [n.norm(dim=1) for n in (values, 2 * values - 1)]
-    error = [float((length[length.isfinite() & (length > 0.1)] - 1).abs().nanmean()) for length in lengths]
-    encoded = bool((values.nan_to_num() >= 0).all()) and error[1] < min(error[0], 0.1)
-    return Field("normals", 2 * values - 1 if encoded else values)
-
-
-def _field_of_npz(path: Path, content: dict[str, Array]) -> Field:
-    kind = one_of(path, content, ("gradient", "normals"))
-    field = _field_of_array(path, content[kind], kind)
+def _field_of_archive(path: Path, content: Mapping[str, Array], packing: str | None) -> Field:
+    matlab = path.suffix.lower() == ".mat"
+    kind: str | None = next((name for name in ("gradient", "normals") if name in content), None)
+    if kind is None and matlab:
+        array = _only_field(path, content)
+    else:
+        kind = one_of(path, content, ("gradient", "normals"))
+        array = content[kind]
+    field = _field_of_array(path, array, packing, last=matlab, kind=kind)
     n, _, h, w = field.values.shape
-    planes: dict[str, Tensor | None] = {"mask": None, "weight": None}
+    planes: dict[str, Tensor | None] = {"mask": field.mask, "weight": None}
     for name, most in (("mask", 1), ("weight", 2)):
         if name in content:
             plane = content[name]
-            if plane.shape[-2:] != (h, w) or plane.size not in {n * h * w, most * n * h * w}:
-                shapes = f"shape {content[name].shape} given beside a {kind} {tuple(field.values.shape)}"
+            if plane.ndim < 2 or plane.shape[-2:] != (h, w) or plane.size not in {n * h * w, most * n * h * w}:
+                shapes = f"shape {plane.shape} given beside a {field.kind} {tuple(field.values.shape)}"
                 raise ValueError(f"{path}: {name}: {shapes}, the sizes must agree")
-            planes[name] = as_tensor(plane.astype(bool if name == "mask" else content[kind].dtype)).reshape(n, -1, h, w)
+            dtype = np.bool_ if name == "mask" else np.float64 if field.values.dtype == torch.float64 else np.float32
+            planes[name] = torch.from_numpy(np.ascontiguousarray(plane, dtype=dtype)).reshape(n, -1, h, w)
     size = pair(path, content["pixel_size"]) if "pixel_size" in content else None
     return field._replace(mask=planes["mask"], weight=planes["weight"], pixel_size=size)
 
 
-def _is_image(path: Path) -> bool:
-    return path.suffix.lower() not in (".npy", ".npz")
+def _only_field(path: Path, content: Mapping[str, Array]) -> Array:
+    """The only array (H, W, 3) or (H, W, 2) of a MAT file, whatever its name."""
+    fields = [array for array in content.values() if array.ndim == 3 and array.shape[-1] in (2, 3)]
+    if len(fields) != 1:
+        have = ", ".join(content) or "nothing"
+        raise ValueError(f"{path}: holds {have}; gradient, normals, or one array (H, W, 3) alone is needed")
+    return fields[0]
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() not in ARRAYS

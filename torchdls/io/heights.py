@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -22,11 +22,11 @@ from torchdls._files import (
     naming,
     one_of,
     pair,
-    read_file,
     require,
     single_map,
 )
 from torchdls.geometry import height_to_points
+from torchdls.io.formats import read_file
 from torchdls.io.meshes import MESH_SUFFIXES, save_mesh
 
 OUTPUT_SUFFIXES = (".npz", ".npy", ".tiff", ".tif", ".png", *MESH_SUFFIXES)
@@ -48,8 +48,8 @@ def load_height(path: str | os.PathLike[str]) -> HeightMap:
     path = Path(path)
     content = read_file(path, (".npz", ".npy", ".tif", ".tiff", ".png"))
     pixel_size = (1.0, 1.0)
-    if isinstance(content, dict):
-        pixel_size = pair(path, content.get("pixel_size", pixel_size))
+    if isinstance(content, Mapping):
+        pixel_size = pair(path, content["pixel_size"]) if "pixel_size" in content else pixel_size
         content = content[one_of(path, content, ("height", "depth"))]
     elif path.suffix.lower() == ".png":
         notes = _png_notes(path)

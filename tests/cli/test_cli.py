@@ -13,7 +13,7 @@ from torchdls import LeastSquares, gradient_to_normals, io, normals_to_gradient,
 from torchdls.cli.main import main
 from torchdls.surfaces import SURFACES
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def surface(n=32):
@@ -146,7 +146,7 @@ def test_invalid_pixels_are_reported_and_left_out(tmp_path, capsys):
     write_map(tmp_path / "n.png", n)
     out = tmp_path / "z.npz"
     assert main(["integrate", str(tmp_path / "n.png"), "--method", "least_squares", "-o", str(out)]) == 0
-    assert "16 pixels without a valid normal" in capsys.readouterr().err
+    assert "16 pixels of background are left out" in capsys.readouterr().err
     height = io.load_height(out)
     assert height.height[..., :4, :4].isnan().all()
     assert int((~height.mask).sum()) == 16
@@ -246,7 +246,7 @@ def test_inputs_that_cannot_be_integrated(tmp_path, capsys, gradient_file):
     np.save(tmp_path / "mask.npy", np.ones((8, 9), bool))
     assert "2 surfaces" in fails(capsys, "integrate", tmp_path / "batch.npy", "-o", out)
     assert "no finite slope" in fails(capsys, "integrate", tmp_path / "nan.npy", "-o", out)
-    assert "no valid normal" in fails(capsys, "integrate", tmp_path / "away.npy", "--quiet", "-o", out)
+    assert "100% of the normals face away" in fails(capsys, "integrate", tmp_path / "away.npy", "-o", out)
     assert "sizes must agree" in fails(capsys, "integrate", gradient_file, "--mask", tmp_path / "mask.npy", "-o", out)
     assert not out.exists()
 

@@ -61,8 +61,8 @@ def test_integer_normal_maps_keep_every_bit(tmp_path, form):
 
 
 def test_alpha_is_the_mask(tmp_path):
-    codes = RNG.integers(60, 200, (4, 5, 4), dtype=np.uint8)
-    codes[..., 3] = 255
+    codes = np.full((4, 5, 4), 255, np.uint8)
+    codes[..., :3] = np.rint((np.moveaxis(unit_normals(4, 5), 0, -1) + 1) / 2 * 255)
     codes[1, 2, 3] = 0
     Image.fromarray(codes).save(tmp_path / "n.png")
     mask = io.load_field(tmp_path / "n.png").mask
@@ -103,7 +103,7 @@ def test_float_tiff_in_either_range(tmp_path, encoded):
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, ">f8"])
 @pytest.mark.parametrize("channels, kind", [(2, "gradient"), (3, "normals")])
 def test_npy_by_number_of_channels(tmp_path, channels, kind, dtype):
-    array = RNG.normal(size=(channels, 5, 7)).astype(dtype)
+    array = (unit_normals(5, 7) if channels == 3 else RNG.normal(size=(2, 5, 7))).astype(dtype)
     for name, stored in (("first", array), ("last", np.moveaxis(array, 0, -1)), ("batch", array[None])):
         np.save(tmp_path / f"{name}.npy", stored)
         field = io.load_field(tmp_path / f"{name}.npy")
@@ -306,7 +306,8 @@ def bad_files(folder):
         "short.png": png[:20],
         "text.tiff": b"hello",
         "cut.tiff": b"II*\0\x08",
-        "field.exr": b"v/1\x01",
+        "cut.exr": b"v/1\x01",
+        "field.xyz": b"",
     }.items():
         (folder / name).write_bytes(content)
 
@@ -316,7 +317,8 @@ BAD = {
     ".npz": ["keys", "sizes", "spacing", "three", "text", "cut"],
     ".png": ["gray", "text", "cut", "short"],
     ".tiff": ["text", "cut"],
-    ".exr": ["field"],
+    ".exr": ["cut"],
+    ".xyz": ["field"],
 }
 
 
