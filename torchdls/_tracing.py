@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-def recorded(*tensors: Tensor) -> bool:
+def is_recorded(*tensors: Tensor) -> bool:
     """True where autograd, a function transform or a compiler follows what happens to one of the tensors.
 
     Where it is False nobody can tell results computed in place from fresh ones, and values may be looked at.
@@ -18,7 +18,7 @@ def recorded(*tensors: Tensor) -> bool:
     return any(torch._C._functorch.is_functorch_wrapped_tensor(t) for t in tensors)
 
 
-def taped(*tensors: Tensor) -> bool:
+def in_plain_autograd(*tensors: Tensor) -> bool:
     """True where plain autograd alone, in reverse mode, follows one of the tensors."""
     transformed = any(torch._C._functorch.is_functorch_wrapped_tensor(t) for t in tensors)
     if transformed or torch.compiler.is_compiling() or torch.autograd.forward_ad._current_level >= 0:
@@ -26,7 +26,7 @@ def taped(*tensors: Tensor) -> bool:
     return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
 
 
-def visible(x: Tensor) -> bool:
+def is_concrete(x: Tensor) -> bool:
     """Whether values can be looked at: not in a traced graph, nor inside vmap, however deep."""
     functorch = torch._C._functorch
     if torch.compiler.is_compiling():
@@ -38,6 +38,11 @@ def visible(x: Tensor) -> bool:
     return True
 
 
-def bool_all(condition: Tensor) -> bool:
+def holds_everywhere(condition: Tensor) -> bool:
     """Whether a condition holds everywhere; True where values cannot be seen."""
-    return not visible(condition) or bool(condition.all())
+    return not is_concrete(condition) or bool(condition.all())
+
+
+def seen_everywhere(condition: Tensor) -> bool:
+    """Whether a condition is seen to hold everywhere; False where values cannot be seen."""
+    return is_concrete(condition) and bool(condition.all())

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdls._statistics import NORMAL_MEDIAN
-from torchdls._tracing import bool_all
+from torchdls._tracing import holds_everywhere
 from torchdls.operators import as_pixel_size, dst2, edge_slopes
 from torchdls.operators.cosine import cosine_matrix
 from torchdls.operators.sine import squared_sines
@@ -106,7 +106,7 @@ def _normalised(curl: Tensor, w: Tensor, dx: float, dy: float) -> tuple[Tensor, 
     x, y = w[:, 0, :, :-1], w[:, 1, :-1]
     edges = torch.stack([x[:, :-1], x[:, 1:], y[:, :, 1:], y[:, :, :-1]], 1)
     cells = (edges > 0).all(1)
-    if not bool_all(cells.flatten(1).any(1)):
+    if not holds_everywhere(cells.flatten(1).any(1)):
         raise ValueError("noise_level: a mask (or the positive weights) holds no complete cell of 2 x 2 pixels")
     halves = 0.5 / torch.where(cells[:, None], edges, 1)
     variance = dx * dx * halves[:, :2].sum(1) + dy * dy * halves[:, 2:].sum(1)
@@ -166,11 +166,11 @@ def _check(gradient: Tensor, mask: Tensor | None, weight: Tensor | None) -> None
     if weight is not None:
         _check_fit("weight", weight, shape, (1, 2))
     inside = gradient if mask is None else torch.where(mask, gradient, 0)
-    if not bool_all(inside.isfinite()):
+    if not holds_everywhere(inside.isfinite()):
         raise ValueError(
             "noise_level: gradient holds NaN or infinite values" + (" inside the mask" if mask is not None else "")
         )
-    if weight is not None and not bool_all(weight.isfinite() & (weight >= 0)):
+    if weight is not None and not holds_everywhere(weight.isfinite() & (weight >= 0)):
         raise ValueError("noise_level: weight holds negative, NaN or infinite values")
 
 

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchdls._tracing import recorded
+from torchdls._tracing import is_recorded
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold, shrink
 
 Order = Literal["atom", "block"]
@@ -74,7 +74,7 @@ def soup_dil_sweep(
     _check(P, D, B, order, unused, threshold)
     _check_levels(mu, bound, B)
     R = (P.mT - B.mT @ D.mT).mT
-    B = B if recorded(R, D, B) else B.clone()
+    B = B if is_recorded(R, D, B) else B.clone()
     _, D, B = residual_sweep(R, D, B, mu, bound, order, unused=unused, learn=learn, threshold=threshold)
     return D, B
 
@@ -98,9 +98,9 @@ def residual_sweep(
     into the set that atoms are chosen from, before it is normalised.
 
     Returns:
-        R, D and B after the sweep. Where no derivative is recorded, R and B are overwritten: no second copy is made.
+        R, D and B after the sweep. Where no derivative is is_recorded, R and B are overwritten: no second copy is made.
     """
-    in_place = not recorded(R, D, B, *([mu] if isinstance(mu, Tensor) else []))
+    in_place = not is_recorded(R, D, B, *([mu] if isinstance(mu, Tensor) else []))
     rule = _Rule(_levels(mu, B, in_place), bound, threshold, unused, in_place, project)
     if not in_place or R.shape[-1] < _SHORTEST or (learn and D.shape[0] < R.shape[0]):
         return _sweep(R, D, B, rule, order, learn)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchdls._tracing import bool_all, visible
+from torchdls._tracing import holds_everywhere, is_concrete
 
 
 class Fields(NamedTuple):
@@ -34,7 +34,7 @@ class Fields(NamedTuple):
 
 def _all_finite(field: Tensor) -> bool:
     """Whether every value is finite; one sum mostly tells, and only a sum that overflows needs the second look."""
-    return not visible(field) or bool(field.detach().sum().isfinite()) or bool(field.isfinite().all())
+    return not is_concrete(field) or bool(field.detach().sum().isfinite()) or bool(field.isfinite().all())
 
 
 def _require(holds: bool, message: str) -> None:
@@ -84,7 +84,7 @@ def within_mask(name: str, fields: Fields) -> Fields:
     """Zero outside the mask, and anchors zero where they are not trusted: NaN there goes no further."""
     gradient, mask, weight, anchor, trust, steps = fields
     if mask is not None:
-        some = bool_all(mask.flatten(1).any(1))
+        some = holds_everywhere(mask.flatten(1).any(1))
         _require(some, f"{name}: mask {tuple(mask.shape)} is False everywhere on a surface")
         gradient = torch.where(mask, gradient, 0)
         weight = None if weight is None else torch.where(mask, weight, 0)
@@ -102,7 +102,9 @@ def check_values(name: str, fields: Fields) -> None:
         if field is not None:
             _require(_all_finite(field), f"{name}: {label} {tuple(field.shape)} is not finite{inside}")
             weight = label.endswith("weight")
-            _require(not weight or bool_all(field >= 0), f"{name}: {label} {tuple(field.shape)} is negative{inside}")
+            _require(
+                not weight or holds_everywhere(field >= 0), f"{name}: {label} {tuple(field.shape)} is negative{inside}"
+            )
 
 
 def fit_field(

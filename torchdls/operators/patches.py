@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdls._tracing import recorded
+from torchdls._tracing import is_recorded
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,8 @@ class Patches:
         return self._scatter(x, size) if torch.compiler.is_compiling() else _Adjoint.apply(x, self, size)
 
     def extract_onto(self, x: Tensor, z: Tensor) -> Tensor:
-        """X + extract(z); where no derivative is recorded, x is overwritten and no copy of the patches is made."""
-        if recorded(x, z):
+        """X + extract(z); where no derivative is is_recorded, x is overwritten and no copy of the patches is made."""
+        if is_recorded(x, z):
             return x + self.extract(z)
         self._gather(z, x)
         return x

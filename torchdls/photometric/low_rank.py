@@ -7,8 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdls._tracing import is_concrete
 from torchdls.photometric.least_squares import lit_samples
-from torchdls.photometric.model import PhotometricResult, check, covariance, fit, known_false, result
+from torchdls.photometric.model import PhotometricResult, check, covariance, fit, result
 
 
 def low_rank_normals(
@@ -91,7 +92,7 @@ def robust_pca(data: Tensor, known: Tensor, lam: Tensor, max_iter: int = 500, to
         )
         largest = torch.maximum(misfit.detach().flatten(1).norm(dim=1), change.detach().flatten(1).norm(dim=1))
         active = active & (largest > tol * norm)
-        if known_false(active.any()):
+        if is_concrete(active) and not bool(active.any()):
             break
     return low_rank
 

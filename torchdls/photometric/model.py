@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchdls._statistics import NORMAL_MEDIAN
+from torchdls._tracing import holds_everywhere
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # the entries of a symmetric 3 x 3 matrix that are kept
 _RANK = 1e-6  # a pivot below this part of its diagonal means that the lights do not span the space
@@ -70,7 +71,7 @@ def check(name: str, images: Tensor, lights: Tensor, mask: Tensor | None, lit: T
     if inside is not None:
         inside = inside.expand(images.shape)
         images = torch.where(inside, images, 0)
-    if known_false(images.detach().isfinite().all()):
+    if not holds_everywhere(images.detach().isfinite()):
         where = "" if inside is None else " where the mask and lit are True"
         raise ValueError(f"{name}: images {shape} holds NaN or infinite values{where}")
     return Samples(images, lights, inside, batched)
@@ -85,16 +86,9 @@ def check_lights(name: str, lights: Tensor, like: Tensor, count: int | None = No
     k = like.shape[-3] if count is None else count
     if tuple(lights.shape) not in {(k, 3), (1, k, 3), (n, k, 3)}:
         raise ValueError(f"{name}: lights {tuple(lights.shape)} given, ({k}, 3) or ({n}, {k}, 3) is needed")
-    if known_false(lights.detach().isfinite().all()):
+    if not holds_everywhere(lights.detach().isfinite()):
         raise ValueError(f"{name}: lights {tuple(lights.shape)} holds NaN or infinite values")
     return lights.to(like).reshape(-1, k, 3)
-
-
-def known_false(condition: Tensor) -> bool:
-    """Whether a condition fails; False where values cannot be seen (in a traced graph, inside vmap)."""
-    if torch.compiler.is_compiling() or torch._C._functorch.is_batchedtensor(condition):
-        return False
-    return not bool(condition)
 
 
 def shading(b: Tensor, lights: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdls._tracing import recorded, visible
+from torchdls._tracing import is_concrete, is_recorded
 from torchdls.operators import dct2, idct2, neumann_eigenvalues, slope_divergence
 from torchdls.operators.cosine import MATRIX_LIMIT, from_half_spectrum, half_spectrum, mirrored
 from torchdls.operators.tables import table
@@ -43,7 +43,7 @@ def _few_at_a_time(height: LinearMap, x: Tensor) -> Tensor:
     several = max(1, _IN_CACHE // (x.shape[-2] * x.shape[-1]))
     if len(x) <= several:
         return height(x)
-    if recorded(x):
+    if is_recorded(x):
         return torch.cat([height(part) for part in x.split(several)])
     result = torch.empty_like(x[:, :1], memory_format=torch.contiguous_format)
     for part, piece in zip(x.split(several), result.split(several), strict=True):
@@ -87,7 +87,7 @@ def _tables(
 
     with U~ the same column in row H - k; in row 0 there is none and Re U <- f Re U, Im U <- g' Im U.
     """
-    if r is None or (visible(r) and not bool(r.any())):
+    if r is None or (is_concrete(r) and not bool(r.any())):
         return _own(*size, *pixel_size, like=like), _other(*size, *pixel_size, like=like)
     return _gains(size, pixel_size, r.to(like))
 

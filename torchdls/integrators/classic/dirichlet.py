@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchdls._tracing import visible
+from torchdls._tracing import is_concrete
 from torchdls.integrators.base import Fields
 from torchdls.operators import GradientOperator, dirichlet_eigenvalues, dst2, edge_slopes
 from torchdls.solvers import SolveResult, solve
@@ -30,7 +30,7 @@ def solve_dirichlet(fields: Fields, *, tol: float, max_iter: int, z0: Tensor | N
     if fields.anchor is not None:
         held = torch.where(known, fields.anchor, held)
     r = fields.anchor_weight
-    if r is not None and r[0].numel() > 1 and visible(r):
+    if r is not None and r[0].numel() > 1 and is_concrete(r):
         r = r if bool((r[..., 1:-1, 1:-1] > 0).any()) else None  # the usual case: anchors on the border alone
     if fields.mask is None and fields.weight is None and (r is None or r[0].numel() == 1):
         return _direct(fields, held, r)

@@ -8,7 +8,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from torchdls._tracing import bool_all, recorded
+from torchdls._tracing import holds_everywhere, is_recorded
 from torchdls.integrators.base import Integrator
 from torchdls.integrators.classic.axis_modes import BASES, Basis, Modes, axis_modes, expand
 from torchdls.integrators.fields import Fields, fit_field
@@ -213,7 +213,7 @@ class TikhonovRegularization(GlobalLeastSquares):
         series z - d H^-1 R z + d^2 (H^-1 R)^2 z, with H the system at d = 0 and R z the derivative of the penalty.
         """
         z = super().integrate(fields)
-        if not isinstance(self.lam, Tensor) or not recorded(self.lam):
+        if not isinstance(self.lam, Tensor) or not is_recorded(self.lam):
             return z
         (h, w), (dx, dy) = z.shape[-2:], fields.steps
         rows, columns = self.modes_of(h, dy, -2, z), self.modes_of(w, dx, -1, z)
@@ -263,7 +263,7 @@ class TikhonovRegularization(GlobalLeastSquares):
     def _prior(self, prior: Tensor, gradient: Tensor) -> Tensor:
         name = type(self).__name__
         fitted = cast(Tensor, fit_field(name, "prior", prior, gradient, channels=(1,)))
-        if not bool_all(fitted.isfinite()):
+        if not holds_everywhere(fitted.isfinite()):
             raise ValueError(f"{name}: prior {tuple(prior.shape)} is not finite")
         return fitted
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchdls._tracing import visible
+from torchdls._tracing import is_concrete
 from torchdls.integrators.base import Integrator
 from torchdls.integrators.classic.least_squares import LeastSquares
 from torchdls.integrators.dls.problem import Model
@@ -39,7 +39,7 @@ def choose_threshold(model: Model, automatic: bool, run: Callable[[Tensor, Tenso
         ValueError: a surface has a mask with holes, unequal weights or an anchor.
     """
     fields = model.fields
-    if visible(fields.gradient) and not bool(even(fields).all()):
+    if is_concrete(fields.gradient) and not bool(even(fields).all()):
         what = "select=True predicts the risk on full rectangles with equal weights and no anchor"
         raise ValueError(f"DLS: {what}; gradient {tuple(fields.gradient.shape)} has others")
     factors = _FACTORS if automatic else (1.0,)

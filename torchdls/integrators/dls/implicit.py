@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchdls._tracing import recorded, taped
+from torchdls._tracing import in_plain_autograd, is_recorded
 from torchdls.dictionary.thresholds import Threshold
 from torchdls.integrators.dls.problem import Model
 from torchdls.operators import GradientOperator, Patches
@@ -126,7 +126,9 @@ class _FixedPoint(torch.autograd.Function):
         kept = [t for t in (dz, db, z, b, w, r, lam, D) if t is not None]
         wanted = any(ctx.needs_input_grad[i] for i in (1, 4, 5))
         # Inside a transform of functions, outer levels may want what this one does not.
-        setting = ctx.setting._replace(codes=wanted or db is not None or (recorded(*kept) and not taped(*kept)))
+        setting = ctx.setting._replace(
+            codes=wanted or db is not None or (is_recorded(*kept) and not in_plain_autograd(*kept))
+        )
         x, y = _FixedPoint.apply(dz, db, w, r, lam, D, free, valid, None, None, setting)
         a, patches = GradientOperator("forward", ctx.setting.pixel_size), ctx.setting.patches
         dw = -a(x) * a(z) if ctx.needs_input_grad[2] else None

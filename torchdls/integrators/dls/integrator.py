@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchdls._tracing import taped, visible
+from torchdls._tracing import in_plain_autograd, is_concrete
 from torchdls.dictionary import dct_dictionary
 from torchdls.dictionary.learners import FixedDictionary, Learner
 from torchdls.dictionary.soup_dil import Order, Unused
@@ -225,14 +225,14 @@ class DLS(Iterative[DLSResult]):
     def _run_within(self, model: Model, callback: Callback | None) -> DLSResult:
         state = self._start(model)
         objective = [self._objective(model, state)]
-        if self.checkpoint and self.n_iter and taped(state.z, state.D, model.lam, model.mu):
+        if self.checkpoint and self.n_iter and in_plain_autograd(state.z, state.D, model.lam, model.mu):
             options = self.learner, self.learn != "fixed", self.n_sweeps, self.bound, self.threshold, self.tol
             parts_of_one = Iteration(self._round, self._settled, self._step, *options)
             end, values, active = run_in_legs(parts_of_one, model, state, objective[0], self.n_iter, callback)
             return DLSResult(end.z, end.D, end.B, values, model.noise, model.lam, model.mu, ~active)
         active = torch.ones_like(model.noise, dtype=torch.bool)
         running, parts = model, [Part(torch.arange(len(active), device=active.device), state)]
-        look = self.tol > 0 and visible(model.fields.gradient)
+        look = self.tol > 0 and is_concrete(model.fields.gradient)
         for iteration in range(1, self.n_iter + 1):
             index, old = parts[-1]
             new, value = self._round(running, old, first=iteration == 1)

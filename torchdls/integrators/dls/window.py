@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchdls._tracing import visible
+from torchdls._tracing import is_concrete
 from torchdls.integrators.base import Fields
 from torchdls.operators import Patches
 
@@ -57,7 +57,7 @@ def live_window(mask: Tensor | None, patches: Patches) -> Window | None:
 
     None where it would be the whole image, or where the values of the mask cannot be looked at.
     """
-    if mask is None or not visible(mask):
+    if mask is None or not is_concrete(mask):
         return None
     shape = (mask.shape[-2], mask.shape[-1])
     grid = patches.grid(shape)

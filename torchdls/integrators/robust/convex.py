@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchdls._tracing import bool_all
+from torchdls._tracing import holds_everywhere
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.robust.base import Robust, State
@@ -45,7 +45,7 @@ class Penalty(NamedTuple):
 
     def majoriser(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Slopes and trusts: every residual weighs strength t / max(|r|, corner)."""
-        if not bool_all(self.corner > 0):
+        if not holds_everywhere(self.corner > 0):
             raise ValueError("smoothing=0 leaves a corner that no quadratic majorises; a data term needs smoothing > 0")
         return self.terms.quadratic(self.strength / torch.maximum(self.terms.size(self.terms.residual(z)), self.corner))
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
+from torchdls._tracing import seen_everywhere
 from torchdls.integrators.base import Fields
 from torchdls.operators import GradientOperator, edge_slopes
 
@@ -56,7 +57,7 @@ class Terms(NamedTuple):
         there = edge_slopes(g, fields.mask)[1]
         trust = torch.ones_like(g[:, :1]) if fields.weight is None else fields.weight
         live = (_spread(present(g) if there is None else there, joint) > 0) & (trust > 0)[:, None]
-        plain = fields.mask is None and (fields.weight is None or _all_seen(trust > 0))
+        plain = fields.mask is None and (fields.weight is None or seen_everywhere(trust > 0))
         if joint:
             trust = trust.mean(1, keepdim=True)
         return cls(g[:, None], trust[:, None], live, fields.steps, joint, plain)
@@ -98,13 +99,6 @@ class Terms(NamedTuple):
         w = self.gather(trust)
         some = w > 0
         return torch.where(some, self.gather(trust * self.slopes) / torch.where(some, w, 1), 0), w
-
-
-def _all_seen(condition: Tensor) -> bool:
-    """Whether a condition is seen to hold everywhere; False where values cannot be seen."""
-    if torch.compiler.is_compiling() or torch._C._functorch.is_batchedtensor(condition):
-        return False
-    return bool(condition.all())
 
 
 def _spread(edges: Tensor, joint: bool) -> Tensor:

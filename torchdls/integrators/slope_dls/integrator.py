@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from torchdls._tracing import visible
+from torchdls._tracing import is_concrete
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import edge_cost
 from torchdls.integrators.fields import even, largest
@@ -143,7 +143,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
     def iterate(self, fields: Fields, callback: Callback | None = None) -> SlopeDLSResult:
         """Outliers replaced, the iterations, and the guard."""
         trusted = torch.ones_like(fields.gradient[:, :1]) if fields.mask is None else fields.mask.to(fields.gradient)
-        if fields.mask is not None and visible(fields.mask) and bool(fields.mask.all()):
+        if fields.mask is not None and is_concrete(fields.mask) and bool(fields.mask.all()):
             fields = fields._replace(mask=None)  # the direct solve serves
         if self.robust:
             gradient, outliers = replace_outliers(fields, tol=self.z_tol)
@@ -241,6 +241,6 @@ def _continue(fields: Fields, z: Tensor, w: Tensor | None, tol: float) -> tuple[
     if w is None:
         return None, z
     held = edge_ends(w) > 0
-    if not visible(held) or not bool(held.all()):
+    if not is_concrete(held) or not bool(held.all()):
         z = harmonic_extension(z, held, tol=tol, pixel_size=fields.steps)
     return extend_edges(w) > 0, extend_edges(GradientOperator("forward", fields.steps)(z))

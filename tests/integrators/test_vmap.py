@@ -1,0 +1,45 @@
+"""`vmap(grad)` of every integrator and photometric method, in every input, equals a loop of gradients."""
+
+import pytest
+import torch
+from torch.func import grad, vmap
+
+from tests.helpers.methods import bumps, method
+from torchdls import INTEGRATORS, low_rank_normals, ring_of_lights, sparse_normals, woodham
+
+PLACES = 2
+
+
+def per_sample(f, *tensors):
+    return vmap(grad(f))(*tensors), torch.stack([grad(f)(*(t[i] for t in tensors)) for i in range(PLACES)])
+
+
+@pytest.mark.parametrize("argument", ["gradient", "weight"])
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_integrators(name, argument):
+    if argument not in ("gradient", *INTEGRATORS[name].accepts):
+        pytest.skip(f"{name} takes no {argument}")
+    if name == "horn_brooks":
+        pytest.skip("horn_brooks relaxes in place, which vmap refuses")
+    options = {"tol": 0.0, "n_iter": 2} if "n_iter" in INTEGRATORS.parameters(name) else {}
+    known = INTEGRATORS.parameters(name)
+    integrator = method(name).build(name, **{k: v for k, v in options.items() if k in known})
+    g = bumps(PLACES, 9, 8)
+    weight = 0.5 + torch.rand(PLACES, 1, 9, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    probe = torch.randn(9, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    if argument == "gradient":
+        together, one_by_one = per_sample(lambda g: (integrator(g) * probe).sum(), g)
+    else:
+        together, one_by_one = per_sample(lambda w, g: (integrator(g, weight=w) * probe).sum(), weight, g)
+    torch.testing.assert_close(together, one_by_one, rtol=1e-4, atol=1e-5)  # solves stop at 1e-6
+    assert one_by_one.any()
+
+
+@pytest.mark.parametrize("normals", [woodham, sparse_normals, low_rank_normals])
+def test_photometric_methods(normals):
+    lights = ring_of_lights(8, 45).double()
+    generator = torch.Generator().manual_seed(4)
+    images = 0.2 + torch.rand(PLACES, 8, 5, 4, dtype=torch.float64, generator=generator)
+    together, one_by_one = per_sample(lambda i: normals(i, lights).normals[0].sum(), images)
+    torch.testing.assert_close(together, one_by_one, rtol=1e-6, atol=1e-8)
+    assert one_by_one.any()
