@@ -5,14 +5,14 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from torchdls.metrics import made, mean_angular_error, rmse, ssim
+from torchdls.metrics import mean_absolute_depth_error, mean_angular_error, rmse, ssim
 from torchdls.surfaces import peaks, saddle, vase
 
 MEASURES = {
     "rmse": rmse,
     "ssim": lambda height, reference, mask=None: ssim(height, reference, 2.0, mask),
     "mean_angular_error": mean_angular_error,
-    "made": made,
+    "mean_absolute_depth_error": mean_absolute_depth_error,
 }
 every_measure = pytest.mark.parametrize("measure", MEASURES.values(), ids=MEASURES)
 
@@ -121,8 +121,10 @@ def test_made_scales_by_the_median_ratio(width):
     for i in range(2):
         d, r = depth[i][mask[i]].numpy(), reference[i][mask[i]].numpy()
         expected = np.abs(np.median(r / d) * d - r).mean()
-        assert float(made(depth, reference, mask)[i]) == pytest.approx(expected)
-    torch.testing.assert_close(made(3 * depth, reference), made(depth, reference))
+        assert float(mean_absolute_depth_error(depth, reference, mask)[i]) == pytest.approx(expected)
+    torch.testing.assert_close(
+        mean_absolute_depth_error(3 * depth, reference), mean_absolute_depth_error(depth, reference)
+    )
 
 
 @every_measure
@@ -188,15 +190,15 @@ def test_float32_stays_float32(measure):
 def test_bad_input(measure):
     height, reference = pair(2)
     mask = holed_mask(2)
-    with pytest.raises(ValueError, match=r"reference \(2, 1, 24, 30\) does not fit height \(2, 1, 24, 31\)"):
+    with pytest.raises(ValueError, match=r"height \(2, 1, 24, 31\) and reference \(2, 1, 24, 30\) differ in width"):
         measure(height, reference[..., 1:])
     with pytest.raises(ValueError, match=r"mask \(3, 1, 24, 31\)"):
         measure(height, reference, holed_mask(3))
     with pytest.raises(ValueError, match=r"height \(24, 31\)"):
         measure(height[0, 0], reference[0, 0])
-    with pytest.raises(TypeError, match=r"mask of torch.float64"):
+    with pytest.raises(TypeError, match=r"mask has dtype torch.float64"):
         measure(height, reference, mask.double())
-    with pytest.raises(TypeError, match=r"reference of torch.int64"):
+    with pytest.raises(TypeError, match=r"reference has dtype torch.int64"):
         measure(height, reference.long())
     mask[1] = False
     with pytest.raises(ValueError, match="without any valid pixel"):

@@ -58,7 +58,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test keeps it equal t
     from torchdls.io import load_mask as load_mask
     from torchdls.io import save_height as save_height
     from torchdls.io import save_mesh as save_mesh
-    from torchdls.metrics import made as made
+    from torchdls.metrics import mean_absolute_depth_error as mean_absolute_depth_error
     from torchdls.metrics import mean_angular_error as mean_angular_error
     from torchdls.metrics import rmse as rmse
     from torchdls.metrics import ssim as ssim
@@ -173,7 +173,7 @@ _MODULE_OF = {
     "add_noise": "noise",
     "noise_sigma": "noise",
     "terrain": "surfaces",
-    "made": "metrics",
+    "mean_absolute_depth_error": "metrics",
     "mean_angular_error": "metrics",
     "rmse": "metrics",
     "ssim": "metrics",

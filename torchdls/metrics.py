@@ -1,4 +1,4 @@
-"""How far a surface is from the truth, modulo what slopes cannot tell: the constant (and, for `made`, the scale).
+"""How far a surface is from the truth, modulo what slopes cannot tell: the constant (for depths, the scale).
 
 All measures are batched and differentiable. They take one surface (1, H, W) or a batch (N, 1, H, W) and give
 one number per surface. Pixels outside the mask, NaN or not, are never read; NaN inside it gives NaN. A mask
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_field, check_fit
 from torchdls.operators import as_pixel_size
 
 if TYPE_CHECKING:
@@ -133,7 +134,7 @@ def mean_angular_error(
     return _mean(torch.where(cells, _angle(slopes, truth), 0), cells)
 
 
-def made(depth: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tensor:
+def mean_absolute_depth_error(depth: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean absolute depth error after scaling by the median ratio: the measure of the DiLiGenT objects.
 
         mean_i |s depth_i - reference_i|,   s = median_i(reference_i / depth_i), i over the mask
@@ -155,7 +156,7 @@ def made(depth: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tensor
 
     Source: Cao, Santo, Shi, Okura, Matsushita, "Bilateral normal integration", ECCV 2022.
     """
-    depth, reference, mask = _fields("made", depth, reference, mask)
+    depth, reference, mask = _fields("mean_absolute_depth_error", depth, reference, mask)
     depth, reference = torch.where(mask, depth, 1), torch.where(mask, reference, 0)
     ratio = torch.where(mask, reference / depth, torch.nan).flatten(-3)
     scale = _median(ratio)
@@ -166,28 +167,16 @@ def _fields(
     name: str, height: Tensor, reference: Tensor, mask: Tensor | None, channels: tuple[int, ...] = (1,)
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The checked fields, with a reference and a mask of batch size 1 expanded, and a mask in any case."""
+    check_field(name, "height", height, 1)
+    check_fit(name, "reference", reference, height, "height", channels=channels)
     shape = tuple(height.shape)
-    if height.ndim not in (3, 4) or shape[-3] != 1:
-        raise ValueError(f"{name}: height {shape} given, (N, 1, H, W) or (1, H, W) is needed")
-    for tensor, what in ((height, "height"), (reference, "reference")):
-        if not tensor.is_floating_point():
-            raise TypeError(f"{name}: {what} of {tensor.dtype} given, floating point is needed")
-    _check_fit(name, "reference", reference, shape, channels)
     reference = reference.expand(*shape[:-3], -1, -1, -1)
     if mask is None:
         return height, reference, torch.ones_like(height, dtype=torch.bool)
-    if mask.dtype != torch.bool:
-        raise TypeError(f"{name}: mask of {mask.dtype} given, bool is needed")
-    _check_fit(name, "mask", mask, shape, (1,))
+    check_fit(name, "mask", mask, height, "height", channels=(1,), dtype=torch.bool)
     if not mask.flatten(-3).any(-1).all():
         raise ValueError(f"{name}: mask {tuple(mask.shape)} holds a surface without any valid pixel")
     return height, reference, mask.expand(shape)
-
-
-def _check_fit(name: str, what: str, tensor: Tensor, shape: tuple[int, ...], channels: tuple[int, ...]) -> None:
-    fits = tensor.ndim == len(shape) and tensor.shape[-2:] == shape[-2:] and tensor.shape[-3] in channels
-    if not fits or (tensor.ndim == 4 and tensor.shape[0] not in (1, shape[0])):
-        raise ValueError(f"{name}: {what} {tuple(tensor.shape)} does not fit height {shape}")
 
 
 def _mean(values: Tensor, where: Tensor) -> Tensor:

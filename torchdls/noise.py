@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_field, check_fit
 from torchdls._statistics import NORMAL_MEDIAN
 from torchdls._tracing import holds_everywhere
 from torchdls.operators import as_pixel_size, dst2, edge_slopes
@@ -154,17 +155,14 @@ def _high_modes(h: int, w: int) -> Tensor:
 
 
 def _check(gradient: Tensor, mask: Tensor | None, weight: Tensor | None) -> None:
-    shape = tuple(gradient.shape)
-    if gradient.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"noise_level: gradient of {gradient.dtype} given, float32 or float64 is needed")
-    if gradient.ndim != 4 or shape[1] != 2 or min(shape[2:]) < 2:
+    check_field("noise_level", "gradient", gradient, 2)
+    if gradient.ndim != 4 or min(gradient.shape[2:]) < 2:
+        shape = tuple(gradient.shape)
         raise ValueError(f"noise_level: gradient {shape} given, (N, 2, H, W) of at least 2 x 2 pixels is needed")
     if mask is not None:
-        if mask.dtype != torch.bool:
-            raise TypeError(f"noise_level: mask of {mask.dtype} given, bool is needed")
-        _check_fit("mask", mask, shape, (1,))
+        check_fit("noise_level", "mask", mask, gradient, "gradient", channels=(1,), dtype=torch.bool)
     if weight is not None:
-        _check_fit("weight", weight, shape, (1, 2))
+        check_fit("noise_level", "weight", weight, gradient, "gradient", channels=(1, 2))
     inside = gradient if mask is None else torch.where(mask, gradient, 0)
     if not holds_everywhere(inside.isfinite()):
         raise ValueError(
@@ -172,12 +170,6 @@ def _check(gradient: Tensor, mask: Tensor | None, weight: Tensor | None) -> None
         )
     if weight is not None and not holds_everywhere(weight.isfinite() & (weight >= 0)):
         raise ValueError("noise_level: weight holds negative, NaN or infinite values")
-
-
-def _check_fit(what: str, tensor: Tensor, shape: tuple[int, ...], channels: tuple[int, ...]) -> None:
-    fits = tensor.ndim == 4 and tensor.shape[0] in (1, shape[0]) and tensor.shape[1] in channels
-    if not fits or tensor.shape[2:] != shape[2:]:
-        raise ValueError(f"noise_level: {what} {tuple(tensor.shape)} does not fit gradient {shape}")
 
 
 # --- what least squares makes of white noise --------------------------------------------------------------------------

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchdls.geometry.conventions import NORMAL_CONVENTIONS, check_field, permute
+from torchdls._checks import check_field
+from torchdls.geometry.conventions import NORMAL_CONVENTIONS, permute
 from torchdls.operators import as_pixel_size
 
 
@@ -25,7 +26,7 @@ def depth_to_points(depth: Tensor, camera: Tensor) -> Tensor:
 
     TypeError or ValueError for a depth or camera that is not usable, as in `normals_to_gradient`.
     """
-    check_field("depth", depth, 1)
+    check_field("depth_to_points", "depth", depth, 1)
     points = depth * apply_matrix(inverse_camera(camera, depth), pixel_grid(depth))
     return permute(points, NORMAL_CONVENTIONS["opencv"])
 
@@ -35,7 +36,7 @@ def height_to_points(height: Tensor, pixel_size: float | Sequence[float] = 1.0) 
 
     TypeError or ValueError for a height or `pixel_size` that is not usable.
     """
-    check_field("height", height, 1)
+    check_field("height_to_points", "height", height, 1)
     dx, dy = as_pixel_size(pixel_size)
     columns, rows, _ = pixel_grid(height).split(1, -3)
     return torch.cat([(columns * dx).expand_as(height), (rows * -dy).expand_as(height), height], -3)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_field
+
 # Canonical component k is sign * source[index], (index, sign) = table[name][k]: frames are signed permutations.
 Axes = tuple[tuple[int, int], ...]
 
@@ -31,7 +33,7 @@ def convert_normals(normals: Tensor, source: str = "opengl", target: str = "open
 
     TypeError for a wrong type, ValueError for a wrong shape or an unknown convention.
     """
-    check_field("normals", normals, 3)
+    check_field("convert_normals", "normals", normals, 3)
     frame = lookup(NORMAL_CONVENTIONS, "source", source), lookup(NORMAL_CONVENTIONS, "target", target)
     return permute(permute(normals, frame[0]), inverse_axes(frame[1]))
 
@@ -41,7 +43,7 @@ def convert_gradient(gradient: Tensor, source: str = "image", target: str = "ima
 
     TypeError for a wrong type, ValueError for a wrong shape or an unknown convention.
     """
-    check_field("gradient", gradient, 2)
+    check_field("convert_gradient", "gradient", gradient, 2)
     frame = lookup(GRADIENT_CONVENTIONS, "source", source), lookup(GRADIENT_CONVENTIONS, "target", target)
     return permute(permute(gradient, frame[0]), inverse_axes(frame[1]))
 
@@ -63,25 +65,3 @@ def inverse_axes(axes: Axes) -> Axes:
     """The way back."""
     order = sorted((i, k, sign) for k, (i, sign) in enumerate(axes))
     return tuple((k, sign) for _, k, sign in order)
-
-
-def check_field(name: str, field: Tensor, channels: int) -> None:
-    """A floating-point tensor with that many channels."""
-    if not isinstance(field, Tensor):
-        raise TypeError(f"{name}: {type(field).__name__} given, a tensor is needed")
-    if field.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"{name}: dtype {field.dtype} given, float32 or float64 is needed")
-    if field.ndim not in (3, 4) or field.shape[-3] != channels or 0 in field.shape:
-        wanted = f"(N, {channels}, H, W) or ({channels}, H, W)"
-        raise ValueError(f"{name}: shape {tuple(field.shape)} given, {wanted} is needed, and not empty")
-
-
-def check_mask(mask: Tensor | None, field: Tensor) -> None:
-    """A mask that fits the field."""
-    if mask is None:
-        return
-    if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
-        raise TypeError(f"mask: {getattr(mask, 'dtype', type(mask).__name__)} given, a bool tensor is needed")
-    wanted = (*field.shape[:-3], 1, *field.shape[-2:])
-    if mask.shape != wanted:
-        raise ValueError(f"mask: shape {tuple(mask.shape)} given beside {tuple(field.shape)}, {wanted} is needed")

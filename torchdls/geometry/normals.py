@@ -38,8 +38,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torchdls._checks import check_field, check_fit
 from torchdls.geometry.cameras import apply_matrix, check_camera, inverse_camera, pixel_grid
-from torchdls.geometry.conventions import NORMAL_CONVENTIONS, check_field, check_mask, inverse_axes, lookup, permute
+from torchdls.geometry.conventions import NORMAL_CONVENTIONS, inverse_axes, lookup, permute
 from torchdls.operators import as_pixel_size
 
 
@@ -104,9 +105,10 @@ def normals_to_gradient(
         ValueError: a shape, the convention, the camera, `pixel_size` or `eps` is not usable, or a camera comes with
             a pixel size.
     """
-    check_field("normals", normals, 3)
+    check_field("normals_to_gradient", "normals", normals, 3)
     axes = lookup(NORMAL_CONVENTIONS, "convention", convention)
-    check_mask(mask, normals)
+    if mask is not None:
+        check_fit("normals_to_gradient", "mask", mask, normals, "normals", channels=(1,), dtype=torch.bool)
     if not 0 <= eps < 1:
         raise ValueError(f"eps: {eps!r} given, a cosine from 0 to below 1 is needed")
     dx, dy = _pixel_size(pixel_size, camera)
@@ -152,7 +154,7 @@ def gradient_to_normals(
     Returns:
         (N, 3, H, W), of length 1; NaN where the gradient is NaN. Raises as `normals_to_gradient` does.
     """
-    check_field("gradient", gradient, 2)
+    check_field("gradient_to_normals", "gradient", gradient, 2)
     axes = lookup(NORMAL_CONVENTIONS, "convention", convention)
     dx, dy = _pixel_size(pixel_size, camera)
     gx, gy = gradient.split(1, -3)

@@ -7,9 +7,10 @@ from math import sqrt
 
 from torch import Tensor, nn
 
+from torchdls._checks import check_field
 from torchdls.integrators.data_term import edge_cost
 from torchdls.integrators.fields import Fields as Fields
-from torchdls.integrators.fields import check_accepted, check_gradient, check_values, fit_fields, within_mask
+from torchdls.integrators.fields import check_accepted, check_values, fit_fields, within_mask
 from torchdls.operators import as_pixel_size, edge_slopes
 
 
@@ -98,7 +99,7 @@ class Integrator(nn.Module):
         """Validate the arguments of `forward` and bring them to the form of `Fields`; never writes to them."""
         name = type(self).__name__
         check_accepted(name, self.accepts, mask=mask, weight=weight, anchor=anchor, anchor_weight=anchor_weight)
-        check_gradient(name, gradient)
+        check_field(name, "gradient", gradient, 2)
         fields = within_mask(name, fit_fields(name, gradient, mask, weight, anchor, anchor_weight))
         check_values(name, fields)
         h = self.unit

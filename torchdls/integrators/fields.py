@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_fit, require
 from torchdls._tracing import holds_everywhere, is_concrete
 
 
@@ -37,26 +38,11 @@ def _all_finite(field: Tensor) -> bool:
     return not is_concrete(field) or bool(field.detach().sum().isfinite()) or bool(field.isfinite().all())
 
 
-def _require(holds: bool, message: str) -> None:
-    if not holds:
-        raise ValueError(message)
-
-
 def check_accepted(name: str, accepts: frozenset[str], **given: object) -> None:
     """ValueError for an argument that the method cannot honour."""
     for label, field in given.items():
         taken = "anchor" if label == "anchor_weight" else label
-        _require(field is None or taken in accepts, f"{name}: takes no {taken}; LeastSquares and DLS do")
-
-
-def check_gradient(name: str, gradient: Tensor) -> None:
-    """A floating-point tensor (N, 2, H, W) or (2, H, W)."""
-    if not isinstance(gradient, Tensor):
-        raise TypeError(f"{name}: gradient is a {type(gradient).__name__}, a tensor is needed")
-    if gradient.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"{name}: gradient has dtype {gradient.dtype}; float32 or float64 is needed")
-    if gradient.ndim not in (3, 4) or gradient.shape[-3] != 2 or 0 in gradient.shape:
-        raise ValueError(f"{name}: gradient {tuple(gradient.shape)} given, (N, 2, H, W) or (2, H, W) is needed")
+        require(field is None or taken in accepts, f"{name}: takes no {taken}; LeastSquares and DLS do")
 
 
 def fit_fields(
@@ -85,7 +71,7 @@ def within_mask(name: str, fields: Fields) -> Fields:
     gradient, mask, weight, anchor, trust, steps = fields
     if mask is not None:
         some = holds_everywhere(mask.flatten(1).any(1))
-        _require(some, f"{name}: mask {tuple(mask.shape)} is False everywhere on a surface")
+        require(some, f"{name}: mask {tuple(mask.shape)} is False everywhere on a surface")
         gradient = torch.where(mask, gradient, 0)
         weight = None if weight is None else torch.where(mask, weight, 0)
         trust = None if trust is None else torch.where(mask, trust, 0)
@@ -100,9 +86,9 @@ def check_values(name: str, fields: Fields) -> None:
     for label in ("gradient", "weight", "anchor", "anchor_weight"):
         field = getattr(fields, label)
         if field is not None:
-            _require(_all_finite(field), f"{name}: {label} {tuple(field.shape)} is not finite{inside}")
+            require(_all_finite(field), f"{name}: {label} {tuple(field.shape)} is not finite{inside}")
             weight = label.endswith("weight")
-            _require(
+            require(
                 not weight or holds_everywhere(field >= 0), f"{name}: {label} {tuple(field.shape)} is negative{inside}"
             )
 
@@ -120,32 +106,9 @@ def fit_field(
     """The field with a batch dimension of N, once its type, shape, dtype and device are found to fit the gradient's."""
     if field is None:
         return None
-    if not isinstance(field, Tensor):
-        raise TypeError(f"{name}: {label} is a {type(field).__name__}, a tensor is needed")
-    dtype = gradient.dtype if dtype is None else dtype
-    if field.dtype != dtype:
-        error = TypeError if dtype == torch.bool else ValueError
-        raise error(f"{name}: {label} has dtype {field.dtype}, {dtype} is needed")
-    if field.device != gradient.device:
-        raise ValueError(f"{name}: {label} is on {field.device}, gradient on {gradient.device}")
-    sizes = (tuple(gradient.shape[-2:]), (1, 1)) if scalar else (tuple(gradient.shape[-2:]),)
-    fits = field.ndim == gradient.ndim and field.shape[-3] in channels and tuple(field.shape[-2:]) in sizes
-    if not fits or (field.ndim == 4 and field.shape[0] not in (1, gradient.shape[0])):
-        shapes = f"gradient {tuple(gradient.shape)} and {label} {tuple(field.shape)}"
-        raise ValueError(f"{name}: {shapes} {_difference(gradient, field, channels)}")
+    check_fit(name, label, field, gradient, "gradient", channels=channels, dtype=dtype, scalar=scalar)
     field = field if field.ndim == 4 else field[None]
     return field.expand(gradient.shape[0] if gradient.ndim == 4 else 1, -1, -1, -1)
-
-
-def _difference(gradient: Tensor, field: Tensor, channels: tuple[int, ...]) -> str:
-    if field.ndim != gradient.ndim:
-        return f"differ in the number of dimensions, {gradient.ndim} and {field.ndim}"
-    if field.shape[-3] not in channels:
-        return f"do not fit: {field.shape[-3]} channels, {' or '.join(map(str, channels))} needed"
-    for dim, axis in ((-1, "width"), (-2, "height")):
-        if field.shape[dim] != gradient.shape[dim]:
-            return f"differ in {axis}"
-    return "differ in batch size"
 
 
 def even(fields: Fields, weight: Tensor | None = None) -> Tensor:

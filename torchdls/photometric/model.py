@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_fit, check_real
 from torchdls._statistics import NORMAL_MEDIAN
 from torchdls._tracing import holds_everywhere
 
@@ -48,22 +49,14 @@ class Samples(NamedTuple):
 
 def check(name: str, images: Tensor, lights: Tensor, mask: Tensor | None, lit: Tensor | None) -> Samples:
     """The arguments of a method as `Samples`; errors name the argument, what came and what is needed."""
-    if not isinstance(images, Tensor):
-        raise TypeError(f"{name}: images is a {type(images).__name__}, a tensor is needed")
-    if images.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"{name}: images of {images.dtype} given, float32 or float64 is needed")
+    check_real(name, "images", images)
     shape = tuple(images.shape)
     if images.ndim not in (3, 4) or shape[-3] < 3 or 0 in shape:
         raise ValueError(f"{name}: images {shape} given, (N, K, H, W) or (K, H, W) of at least K = 3 lights is needed")
     lights = check_lights(name, lights, images)
     for label, field, channels in (("mask", mask, 1), ("lit", lit, shape[-3])):
-        if field is None:
-            continue
-        if not isinstance(field, Tensor) or field.dtype != torch.bool:
-            raise TypeError(f"{name}: {label} is {getattr(field, 'dtype', type(field).__name__)}, bool is needed")
-        fits = field.ndim == images.ndim and field.shape[-3:] == (channels, *shape[-2:])
-        if not fits or (field.ndim == 4 and field.shape[0] not in (1, shape[0])):
-            raise ValueError(f"{name}: {label} {tuple(field.shape)} does not fit images {shape}")
+        if field is not None:
+            check_fit(name, label, field, images, "images", channels=(channels,), dtype=torch.bool)
     inside = mask if lit is None else lit if mask is None else mask & lit
     batched = images.ndim == 4
     if not batched:
