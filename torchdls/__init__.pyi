@@ -85,4 +85,5 @@ from .surfaces import SURFACES as SURFACES
 from .surfaces import Surface as Surface
 from .surfaces import terrain as terrain
 
+__all__: list[str]
 __version__: str
