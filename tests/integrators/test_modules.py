@@ -137,7 +137,7 @@ def test_compiles_without_a_break() -> None:
         a = GradientOperator()
         return solve_direct(a.adjoint(w * a(x)), None)
 
-    cases = [
+    cases: list[tuple[Any, tuple[Tensor, ...]]] = [
         (LeastSquares(), (g,)),
         (lambda P, D, B: soup_dil_sweep(P, D, B, 0.5), (P, D, B)),
         (step, (g[:, :1], g.abs())),
