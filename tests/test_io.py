@@ -1,6 +1,7 @@
 """Files are checked against other libraries' readers and writers, and against closed forms."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
