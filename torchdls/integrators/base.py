@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from math import sqrt
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 from torchdls._checks import check_field
+from torchdls._options import plain, same, shown
 from torchdls.integrators.data_term import edge_cost
 from torchdls.integrators.fields import Fields as Fields
 from torchdls.integrators.fields import check_accepted, check_values, fit_fields, within_mask
@@ -71,6 +75,43 @@ class Integrator(nn.Module):
         height = height if self.unit == 1 else height * self.unit
         return height if gradient.ndim == 4 else height[0]
 
+    if TYPE_CHECKING:  # the call of `nn.Module` gives Any
+
+        def __call__(
+            self,
+            gradient: Tensor,
+            mask: Tensor | None = None,
+            weight: Tensor | None = None,
+            anchor: Tensor | None = None,
+            anchor_weight: Tensor | float | None = None,
+        ) -> Tensor:
+            """As `forward`."""
+
+    def options(self) -> dict[str, Any]:
+        """The arguments of the constructor as plain data, with which `torchdls.build` makes the integrator again.
+
+        Returns:
+            Numbers, words, None and tuples; of a part such as a learner or a data term {"name": ..., option: value};
+            of a tensor, whose values live in the `state_dict`, the mark {"tensor": shape, "dtype": ..., "kind": ...}.
+
+        Raises:
+            TypeError: an option has no form as plain data, such as a learner that is no registered class.
+        """
+        return {name: plain(value) for name, value in self._arguments().items()}
+
+    def _arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor: each is kept as the attribute of its name."""
+        return {name: getattr(self, name) for name in inspect.signature(_class_of(self)).parameters}
+
+    def __repr__(self) -> str:
+        """The call that makes it: every option that differs from its default."""
+        kind, arguments = _class_of(self), self._arguments()
+        parameters = inspect.signature(kind).parameters.items()
+        needed = {name: arguments[name] for name, p in parameters if p.default is p.empty}
+        defaults = kind(**needed)._arguments()
+        told = [n for n, value in arguments.items() if n in needed or not same(value, defaults[n])]
+        return f"{kind.__name__}({', '.join(f'{name}={shown(arguments[name])}' for name in told)})"
+
     def integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels from checked fields; what a subclass provides."""
         raise TypeError(f"{type(self).__name__}: an integrator must define integrate(fields)")
@@ -108,3 +149,9 @@ class Integrator(nn.Module):
             anchor_weight=None if fields.anchor_weight is None else fields.anchor_weight * h**2,
             steps=(self.pixel_size[0] / h, self.pixel_size[1] / h),
         )
+
+
+def _class_of(module: Integrator) -> type[Integrator]:
+    """The class of a module, whatever parametrisations it has been given since."""
+    kind: type[Integrator] = parametrize.type_before_parametrizations(module)
+    return kind
