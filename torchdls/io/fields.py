@@ -112,8 +112,8 @@ def load_camera(path: str | os.PathLike[str]) -> Tensor:
     else:
         if path.is_file() and path.stat().st_size > 100_000:
             raise ValueError(f"{path}: too long for a text of three rows")
-        with naming(path, "text"):
-            matrix = np.loadtxt(path, ndmin=2)
+        with naming(path, "text"), open(path, encoding="utf-8") as file:
+            matrix = np.loadtxt(file, ndmin=2)
     if matrix.shape != (3, 3) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
         given = f"shape {matrix.shape} of {matrix.dtype} is no camera"
         raise ValueError(f"{path}: {given}, 3 x 3 finite numbers are needed")

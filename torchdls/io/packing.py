@@ -153,7 +153,7 @@ def _find(channels: Array, candidates: list[Array]) -> tuple[str, Array]:
         if packed and not idle:
             misfit |= {name: _misfit(_DECODE[name](last)) for name in ("rgb", "rgz")}
         if channels.dtype.kind == "f" and not (packed and idle and _is_idle(_root(*first[:, :2].T), first[:, 2])):
-            misfit["xyz"] = _misfit(first[:, :3])
+            misfit["xyz"] = _misfit(first[:, :3], grazing=not packed)
     best = min(misfit.values(), default=np.inf)
     for name, value in misfit.items():
         if value <= FITS and value <= max(2 * best, best + _TIE):
@@ -172,11 +172,11 @@ def _tell(misfit: dict[str, float]) -> str:
     return f" ({found} off); {wish}" if found else f"; {wish}"
 
 
-def _misfit(n: Array) -> float:
-    """Median distance of the lengths from 1; infinite where most vectors are at grazing angle."""
+def _misfit(n: Array, grazing: bool = False) -> float:
+    """Median distance of the lengths from 1; infinite where most vectors are at grazing angle, unless they may be."""
     n = n.astype(np.float64)
     x, y, z = np.median(np.abs(n), axis=0)
-    if z < 0.1 or max(x, y) > 0.95:
+    if (z < 0.1 or max(x, y) > 0.95) and not grazing:
         return float("inf")
     return float(np.median(np.abs(np.linalg.norm(n, axis=-1) - 1)))
 

@@ -1,0 +1,217 @@
+"""How a normal map is taken: its convention, what faces away, what is background, and what is said of it."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from torchdls import LeastSquares, gradient_to_normals, guess_convention, io
+from torchdls.cli.main import main
+from torchdls.geometry import NORMAL_CONVENTIONS, convert_normals
+from torchdls.surfaces import SURFACES
+
+FRONT = ["opengl", "directx", "kornia", "matlab"]
+
+
+def terrain():
+    """A twisted surface: its readings differ."""
+    return SURFACES["peaks"](40, dtype=torch.float64)
+
+
+def write(path, normals, noise=0.0, bits=8):
+    n = normals[0].permute(1, 2, 0).numpy()
+    n = n + noise * np.random.default_rng(0).normal(size=n.shape)
+    if path.suffix == ".npy":
+        np.save(path, n / np.linalg.norm(n, axis=-1, keepdims=True))
+    else:
+        Image.fromarray(np.rint(np.clip((n + 1) / 2, 0, 1) * 255).astype(np.uint8)).save(path)
+    return path
+
+
+def run(capsys, path, *options, status=0):
+    out = path.with_name("z.npy")
+    arguments = ["integrate", str(path), "--method", "least_squares", "-o", str(out), "--force", *options]
+    assert main(arguments) == status
+    return capsys.readouterr()
+
+
+@pytest.mark.parametrize("true", FRONT)
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+def test_auto_takes_the_reading_that_is_a_surface(tmp_path, capsys, true, noise):
+    s = terrain()
+    path = write(tmp_path / "n.npy", gradient_to_normals(s.gradient, true), noise)
+    said = run(capsys, path, "--convention", "auto")
+    assert said.err == ""
+    height, exact = io.load_height(tmp_path / "z.npy").height, LeastSquares()(s.gradient)
+    # The sign of the height cannot be told from its normals: directx and kornia are mirror images in depth.
+    error = min(float((sign * height - exact).std()) for sign in (1, -1))
+    assert error < (0.25 if noise else 1e-5) * float(exact.std())
+    assert "convention " + {"kornia": "directx"}.get(true, true) in said.out
+
+
+def test_auto_takes_normals_that_point_into_the_picture(tmp_path, capsys):
+    s = terrain()
+    path = write(tmp_path / "n.npy", gradient_to_normals(s.gradient, "opencv"))
+    assert "convention opencv" in run(capsys, path, "--convention", "auto").out
+    torch.testing.assert_close(io.load_height(tmp_path / "z.npy").height, LeastSquares()(s.gradient))
+
+
+@pytest.mark.parametrize("true", FRONT)
+@pytest.mark.parametrize("read", FRONT)
+def test_a_wrong_reading_is_one_line_of_warning_that_names_the_right_one(tmp_path, capsys, true, read):
+    path = write(tmp_path / "n.png", gradient_to_normals(terrain().gradient, true))
+    lines = run(capsys, path, "--convention", read, "--quiet").err.splitlines()
+    same = {"kornia": "directx"}
+    if same.get(true, true) == same.get(read, read):  # equally integrable
+        assert lines == []
+        return
+    assert len(lines) == 1
+    assert lines[0].startswith(f"torchdls: warning: {path}: under convention {same.get(true, true)!r} the normals are ")
+    assert f"--convention {same.get(true, true)} or auto" in lines[0]
+
+
+@pytest.mark.parametrize("name", ["sphere", "bowl", "saddle", "plane", "noise", "ridge"])
+def test_no_warning_where_the_usual_reading_is_as_good(tmp_path, capsys, name):
+    """Surfaces whose twist z_xy is small, where a ratio of noise to noise would decide."""
+    y, x = np.mgrid[-1:1:48j, -1:1:48j] * 10.0
+    z = {
+        "sphere": np.sqrt(30.0**2 - x**2 - y**2),
+        "bowl": (x**2 + y**2) / 20,
+        "saddle": (x**2 - y**2) / 20,
+        "plane": 0.3 * x - 0.2 * y,
+        "noise": np.random.default_rng(0).normal(size=x.shape),
+        "ridge": 3 * np.cos(x / 3),
+    }[name]
+    gradient = torch.from_numpy(np.stack(np.gradient(z, 20 / 47)[::-1]))[None]
+    path = write(tmp_path / "n.png", gradient_to_normals(gradient))
+    assert run(capsys, path, "--quiet").err == ""
+
+
+def test_candidates_share_one_scale():
+    """The saddle x^2 - y^2 is a surface in every reading; its twist is noise alone, which must not decide."""
+    y, x = np.mgrid[-1:1:40j, -1:1:40j]
+    noise = 1e-3 * np.random.default_rng(0).normal(size=(2, 40, 40))
+    plain = gradient_to_normals(torch.from_numpy(np.stack([x, -y]) + noise)[None])
+    assert max(guess_convention(plain, candidates=FRONT).residual.values()) < 0.1
+    twisted = gradient_to_normals(torch.from_numpy(np.stack([y, x]) + noise)[None])
+    residual = guess_convention(twisted, candidates=FRONT).residual
+    assert residual["opengl"] < 0.1 < 0.9 < residual["directx"]
+
+
+@pytest.mark.parametrize("as_read, holds", [("opengl", "opencv"), ("kornia", "opencv"), ("opencv", "opengl")])
+def test_normals_that_face_away_are_an_error_that_names_the_way_out(tmp_path, capsys, as_read, holds):
+    path = write(tmp_path / "n.png", gradient_to_normals(terrain().gradient, holds))
+    message = run(capsys, path, "--convention", as_read, status=2).err
+    assert message.count("\n") == 1
+    assert f"100% of the normals face away from the viewer under convention '{as_read}'" in message
+    facing = "opencv" if holds == "opencv" else "opengl and directx and kornia and matlab"
+    assert f"they face it under {facing}: --convention {holds}" in message
+
+
+def test_only_the_mask_decides_what_faces_away(tmp_path, capsys):
+    n = gradient_to_normals(terrain().gradient)
+    n[..., :, :30] *= -1
+    path = write(tmp_path / "n.npy", n)
+    assert "75% of the normals face away" in run(capsys, path, status=2).err
+    mask = np.zeros((40, 40), bool)
+    mask[:, 29:] = True
+    np.save(tmp_path / "m.npy", mask)
+    said = run(capsys, path, "--mask", str(tmp_path / "m.npy"))
+    assert said.err == f"{path}: 40 normals that face away or lie at grazing angle are left out\n"
+
+
+@pytest.mark.parametrize("value", [0.0, float("nan")])
+def test_background_is_counted_as_background(tmp_path, capsys, value):
+    n = gradient_to_normals(terrain().gradient)
+    n[..., :5, :7] = value
+    n[..., 20, 20] *= -1
+    np.save(tmp_path / "n.npy", n)
+    background, away = run(capsys, tmp_path / "n.npy").err.splitlines()
+    assert background.endswith("n.npy: 35 pixels of background are left out")
+    assert away.endswith("n.npy: 1 normals that face away or lie at grazing angle are left out")
+
+
+def test_a_camera_decides_what_faces_it(tmp_path, capsys):
+    """A plane seen so steeply from the side that its normal points away from the axis, but not from the camera."""
+    n = torch.tensor([-0.995, 0.0, 0.0999], dtype=torch.float64)
+    n = (n / n.norm())[None, :, None, None].expand(1, 3, 20, 20)
+    path = tmp_path / "n.npy"
+    np.save(path, n)
+    said = run(capsys, path, "--convention", "opencv", "--camera", "20,20,-30,10", status=0)
+    assert "convention opencv" in said.out
+    assert "face away" in run(capsys, path, "--convention", "opencv", status=2).err
+
+
+def test_what_is_read_is_said_and_can_be_said(tmp_path, capsys):
+    path = write(tmp_path / "n.png", gradient_to_normals(terrain().gradient))
+    assert run(capsys, path).out.startswith(f"{path}: read as rgb (x, y, z = 2 c - 1), convention opengl\n")
+    said = run(capsys, path, "--channels", "rg").out
+    assert said.startswith(f"{path}: read as rg (x, y = 2 c - 1, z from the length 1, blue is not read)")
+    assert "choose from rgb" in run(capsys, path, "--channels", "bgr", status=2).err
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (30, 30, 3), np.uint8)).save(tmp_path / "noise.png")
+    message = run(capsys, tmp_path / "noise.png", status=2).err
+    assert "the vectors have length 1 in none of the packings" in message
+    assert "--channels" in message
+
+
+def test_every_convention_is_tried():
+    n = gradient_to_normals(terrain().gradient)
+    for name in NORMAL_CONVENTIONS:
+        turned = convert_normals(n, target=name)
+        guess = guess_convention(turned, candidates=list(NORMAL_CONVENTIONS))
+        assert guess.residual[name] == min(guess.residual.values())
+
+
+# --- what is wrong with the options --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (["--set", "tol=abc"], "--set: tol=abc given, a number is needed (default: 1e-06)"),
+        (["--set", "tol=[1]"], "--set: tol=[1] given, a number is needed (default: 1e-06)"),
+        (["--set", "tol=None"], "--set: tol=None given, a number is needed (default: 1e-06)"),
+        (["--set", "tol=(1,2)"], "--set: tol=(1, 2) given, which is not usable (default: 1e-06)"),
+        (["--set", "foo=1"], "least_squares has no option 'foo'; its options and their defaults: tol=1e-06, max_iter"),
+        (["--set", "pixel_size=2"], "--set: pixel_size has an option of its own, --pixel-size"),
+        (["--method", "slope_dls", "--set", "sigma=abc"], "--set: sigma=abc given, which is not usable"),
+        (["--method", "slope_dls", "--set", "learn=perhaps"], "--set: learn=perhaps given, True or False is needed"),
+        (["--method", "slope_dls", "--set", "patch_sizes=3.5"], "--set: patch_sizes=3.5 given, which is not usable"),
+        (["--method", "magic"], "--method: 'magic' is unknown; choose from least_squares"),
+        (["--camera", "1,2,3"], "--camera: '1,2,3' given, a file or four numbers FX,FY,CX,CY are needed"),
+        (["--camera", "1,2,3,4,5"], "--camera: '1,2,3,4,5' given, a file or four numbers"),
+        (["--camera", "none.txt"], "none.txt: No such file or directory"),
+    ],
+)
+def test_a_wrong_option_is_said_before_any_file_is_read(tmp_path, capsys, options, message):
+    arguments = ["integrate", str(tmp_path / "absent.png"), "--method", "least_squares", *options]
+    assert main([*arguments, "-o", str(tmp_path / "z.npy")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("torchdls: error: ")
+    assert message in error
+    assert error.count("\n") == 1
+    for python in ("<class", "NoneType", "instances", "Traceback", "__", "object is not", "Error"):
+        assert python not in error
+
+
+@pytest.mark.parametrize("method", ["dls", "slope_dls", "huber", "spectral_regularization", "mumford_shah"])
+def test_no_value_of_any_option_lets_python_speak(tmp_path, capsys, method):
+    from torchdls import INTEGRATORS
+
+    for name in INTEGRATORS.parameters(method):
+        for value in ("abc", "[1]", "None", "{'a': 1}", "1e999", "-1", "(1, 2)", "'"):
+            arguments = ["integrate", str(tmp_path / "absent.npy"), "--method", method, "--set", f"{name}={value}"]
+            assert main([*arguments, "-o", str(tmp_path / "z.npy")]) == 2
+            error = capsys.readouterr().err
+            assert error.count("\n") == 1
+            for python in ("<class", "NoneType", "instances of", "__", "object is not", "unhashable", "dtype"):
+                assert python not in error
+
+
+def test_memory_that_is_not_there_is_one_line(monkeypatch, tmp_path, capsys):
+    def exhaust(*arguments, **options):
+        raise RuntimeError("[enforce fail at alloc_cpu.cpp:75] DefaultCPUAllocator: can't allocate memory: you tried")
+
+    monkeypatch.setattr(io, "load_field", exhaust)
+    assert main(["integrate", "n.npy", "-o", str(tmp_path / "z.npy")]) == 2
+    assert capsys.readouterr().err == "torchdls: error: there is not enough memory for an input of this size\n"
