@@ -96,7 +96,7 @@ def _read_picture(path: Path, head: bytes) -> Array:
 
 def _read_tiff(path: Path) -> Array:
     tifffile: Any = require("tifffile", "files")
-    with _silent("tifffile"), tifffile.TiffFile(path) as file:
+    with silent("tifffile"), tifffile.TiffFile(path) as file:
         series = file.series[0]
         plain = all(page.compression == 1 for page in series.pages if page is not None)
         check_declared(math.prod(series.shape) * series.dtype.itemsize, os.path.getsize(path), 1 if plain else RATIO)
@@ -109,7 +109,7 @@ def _read_tiff(path: Path) -> Array:
 
 
 @contextmanager
-def _silent(name: str) -> Iterator[None]:
+def silent(name: str) -> Iterator[None]:
     """Nothing of what a reader logs: the error that follows says it in one line."""
     logger = logging.getLogger(name)
     level = logger.level
