@@ -179,7 +179,7 @@ def test_a_large_map_is_judged_by_tiles_as_it_is_as_a_whole(perspective):
     whole = guess_convention(normals, mask, candidates, camera=k)
     assert guess.convention == whole.convention
     for name in candidates:
-        assert guess.residual[name] == pytest.approx(whole.residual[name], abs=0.1)
+        assert guess.residual[name] == pytest.approx(whole.residual[name], abs=0.2)
 
 
 # --- what is wrong with the options --------------------------------------------------------------------------------
