@@ -45,7 +45,7 @@ def check_output(
     if not parent.is_dir():
         raise FileNotFoundError(f"{path}: the directory {parent} does not exist")
     if path.is_dir() or (os.path.lexists(path) and not overwrite):
-        raise FileExistsError(f"{path}: exists already; overwrite=True (--force on the command line) replaces a file")
+        raise FileExistsError(f"{path}: exists already; only --force (overwrite=True) replaces a file")
     return path
 
 
@@ -188,10 +188,14 @@ def one_of(path: Path, content: Mapping[str, Any], names: Sequence[str]) -> str:
 
 
 def pair(path: Path, value: Any) -> tuple[float, float]:
-    pair = np.asarray(value, np.float64).ravel()
-    if pair.size not in (1, 2) or not (np.isfinite(pair) & (pair > 0)).all():
-        raise ValueError(f"{path}: pixel_size {value!r}, one or two positive numbers are needed")
-    return float(pair[0]), float(pair[-1])
+    try:
+        numbers = np.asarray(value, np.float64).ravel()
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.size not in (1, 2) or not (np.isfinite(numbers) & (numbers > 0)).all():
+        given = " x ".join(f"{number:g}" for number in numbers[:3]) or "nothing of use"
+        raise ValueError(f"{path}: pixel_size: {given} given, one or two positive numbers are needed")
+    return float(numbers[0]), float(numbers[-1])
 
 
 def as_tensor(array: Array) -> Tensor:

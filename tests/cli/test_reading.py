@@ -162,6 +162,26 @@ def test_every_convention_is_tried():
         assert guess.residual[name] == min(guess.residual.values())
 
 
+@pytest.mark.parametrize("perspective", [False, True])
+def test_a_large_map_is_judged_by_tiles_as_it_is_as_a_whole(perspective):
+    from torchdls.cli.reading import _tiles
+
+    k = torch.tensor([[900.0, 0, 300], [0, 900, 200], [0, 0, 1]], dtype=torch.float64) if perspective else None
+    y, x = torch.meshgrid(*(torch.arange(d, dtype=torch.float64) for d in (400, 520)), indexing="ij")
+    u = 0.02 * torch.sin(x / 40) * torch.cos(y / 30)
+    gradient = torch.stack([torch.gradient(u, dim=d)[0] for d in (1, 0)])[None] * (1 if perspective else 50)
+    normals = gradient_to_normals(gradient, "directx" if k is None else "opencv", camera=k)
+    mask = (x < 450)[None, None]
+    tiles = _tiles(normals, mask, k, size=64, most=9)
+    assert tiles[0].shape == (9, 3, 64, 64)
+    candidates = ["opencv"] if perspective else FRONT
+    guess = guess_convention(tiles[0], tiles[1], candidates, camera=tiles[2])
+    whole = guess_convention(normals, mask, candidates, camera=k)
+    assert guess.convention == whole.convention
+    for name in candidates:
+        assert guess.residual[name] == pytest.approx(whole.residual[name], abs=0.2)
+
+
 # --- what is wrong with the options --------------------------------------------------------------------------------
 
 

@@ -1,6 +1,8 @@
 """Every format that is read, written by other libraries, against the normals that went in."""
 
+import struct
 import sys
+import zlib
 
 import numpy as np
 import OpenEXR
@@ -10,6 +12,7 @@ import tifffile
 from PIL import Image
 
 from torchdls import io
+from torchdls.io.formats import read_file
 
 
 def dome(h=24, w=32):
@@ -110,6 +113,29 @@ def test_an_exr_of_one_channel_is_a_mask(tmp_path):
     plane[3:9] = 1
     write_exr(tmp_path / "m.exr", {"Y": plane})
     np.testing.assert_array_equal(io.load_mask(tmp_path / "m.exr")[0, 0], plane > 0)
+
+
+@pytest.mark.parametrize("interlace, passes", [(0, 1), (1, 7)])
+@pytest.mark.parametrize("size", [(13, 11), (3, 2), (1, 1)])
+def test_sixteen_bits_of_colour_in_png_interlaced_or_not(tmp_path, interlace, passes, size):
+    """A PNG put together by its specification: pass k holds every dy-th row and dx-th column from (y, x)."""
+    codes = np.random.default_rng(0).integers(0, 65536, (*size, 3)).astype(">u2")
+    starts = [(0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)]
+    parts = [codes[y::dy, x::dx] for x, y, dx, dy in starts] if interlace else [codes]
+    assert len(parts) == passes
+    raw = b"".join(b"\0" + row.tobytes() for part in parts if part.size for row in part)
+
+    def chunk(kind, body):
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = struct.pack(">IIBBBBB", size[1], size[0], 16, 2, 0, 0, interlace)
+    for name, data in (("n", raw), ("short", raw[:-1]), ("long", raw + b"\0"), ("filter", b"\7" + raw[1:])):
+        content = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
+        (tmp_path / f"{name}.png").write_bytes(b"\x89PNG\r\n\x1a\n" + content)
+    np.testing.assert_array_equal(read_file(tmp_path / "n.png", (".png",)), codes)
+    for name in ("short", "long", "filter"):
+        with pytest.raises(ValueError, match=rf"{name}\.png: cannot be read as PNG: its compressed data"):
+            read_file(tmp_path / f"{name}.png", (".png",))
 
 
 # --- MAT -----------------------------------------------------------------------------------------------------------

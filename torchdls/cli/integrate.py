@@ -71,13 +71,13 @@ def _integrate(arguments: argparse.Namespace) -> None:
     gradient, mask = reading.gradient, None if reading.mask.all() else reading.mask
     method = build_method(arguments.method, pixel_size, arguments.set)
     weight = None if field.weight is None else field.weight.to(dtype)
-    for note in reading.notes:
-        if not arguments.quiet or "warning" in note:
-            print(note, file=sys.stderr)
     start = time.perf_counter()
     with torch.no_grad():
         height, noise = run_method(arguments.method, method, arguments.quiet, gradient, mask=mask, weight=weight)
     seconds = time.perf_counter() - start
+    for note in reading.notes:  # now that the method has taken its input: an error is one line alone
+        if not arguments.quiet or "warning" in note:
+            print(note, file=sys.stderr)
     for path in arguments.out:
         _save(path, height, mask, gradient, pixel_size, camera, arguments.force)
     if not arguments.quiet:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -38,20 +39,24 @@ def read_normals(path: str, field: Field, asked: str | None, camera: Tensor | No
     inside = given if field.mask is None else given & field.mask
     if not inside.any():
         raise ValueError(f"{path}: no valid normal, all is background")
-    shares = {
-        name: float(normals_to_gradient(field.values, name, mask=inside, camera=camera).mask.sum() / inside.sum())
-        for name in known
-    }
-    facing = [name for name in known if shares[name] > 0.5]
     name = known[0] if asked in (None, AUTO) else asked
-    if asked == AUTO and facing:
-        name = facing[0]
-    if name not in facing:
-        _refuse(path, name, shares[name], facing)
-    best, clearer = _most_integrable(field.values, inside, facing, name, camera)
-    notes = [f"torchdls: warning: {path}: {clearer}"] * bool(clearer and asked != AUTO)
-    name = best if asked == AUTO else name
     found = normals_to_gradient(field.values, name, mask=inside, camera=camera)
+    if found.mask.sum() <= 0.5 * inside.sum():
+        shares = {
+            other: float(normals_to_gradient(field.values, other, mask=inside, camera=camera).mask.sum() / inside.sum())
+            for other in known
+        }
+        facing = [other for other in known if shares[other] > 0.5]
+        if asked != AUTO or not facing:
+            _refuse(path, name, shares[name], facing)
+        name = facing[0]
+    # Of readings with the same sign of z all face the viewer, or none.
+    facing = [other for other in known if NORMAL_CONVENTIONS[other][2] == NORMAL_CONVENTIONS[name][2]]
+    best, clearer = _most_integrable(*_tiles(field.values, inside, camera), facing, name)
+    notes = [f"torchdls: warning: {path}: {clearer}"] * bool(clearer and asked != AUTO)
+    if asked == AUTO:
+        name = best
+        found = normals_to_gradient(field.values, name, mask=inside, camera=camera)
     background = int((~given if field.mask is None else ~given & field.mask).sum())
     notes += [f"{path}: {background} pixels of background are left out"] * bool(background)
     notes += [f"{path}: {int(found.invalid)} normals that face away or lie at grazing angle are left out"] * bool(
@@ -67,7 +72,7 @@ def _refuse(path: str, name: str, share: float, facing: list[str]) -> None:
 
 
 def _most_integrable(
-    normals: Tensor, mask: Tensor, candidates: list[str], name: str, camera: Tensor | None
+    normals: Tensor, mask: Tensor, camera: Tensor | None, candidates: list[str], name: str
 ) -> tuple[str, str]:
     """The convention under which the normals are most nearly those of a surface, and a word if `name` is far worse."""
     from torchdls.geometry import guess_convention
@@ -84,3 +89,26 @@ def _most_integrable(
         f"under convention {guess.convention!r} the normals are {times} more nearly those of a surface "
         f"than under {name!r}; --convention {guess.convention} or auto takes it"
     )
+
+
+def _tiles(
+    normals: Tensor, mask: Tensor, camera: Tensor | None, size: int = 256, most: int = 16
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """A large map as a batch of tiles, spread over what is valid: enough to tell a convention by."""
+    import torch
+
+    h, w = normals.shape[-2:]
+    if h * w <= most * size**2 or min(h, w) < size:
+        return normals, mask, camera
+    corners = [
+        (y, x)
+        for y in range(0, h - size + 1, size)
+        for x in range(0, w - size + 1, size)
+        if mask[..., y : y + size, x : x + size].any()
+    ]
+    corners = random.Random(0).sample(corners, min(most, len(corners))) or [(0, 0)]
+    cut = [(..., slice(y, y + size), slice(x, x + size)) for y, x in corners]
+    if camera is not None:  # the principal point, seen from the corner of each tile
+        camera = camera.repeat(len(corners), 1, 1)
+        camera[:, :2, 2] -= torch.tensor([(x, y) for y, x in corners], dtype=camera.dtype)
+    return torch.cat([normals[part] for part in cut]), torch.cat([mask[part] for part in cut]), camera

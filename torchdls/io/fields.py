@@ -113,7 +113,11 @@ def load_camera(path: str | os.PathLike[str]) -> Tensor:
         if path.is_file() and path.stat().st_size > 100_000:
             raise ValueError(f"{path}: too long for a text of three rows")
         with naming(path, "text"), open(path, encoding="utf-8") as file:
-            matrix = np.loadtxt(file, ndmin=2)
+            rows = [line.partition("#")[0].split() for line in file]
+            try:
+                matrix = np.array([[float(word) for word in row] for row in rows if row])
+            except ValueError:
+                raise ValueError("three rows of three numbers are needed") from None
     if matrix.shape != (3, 3) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
         given = f"shape {matrix.shape} of {matrix.dtype} is no camera"
         raise ValueError(f"{path}: {given}, 3 x 3 finite numbers are needed")

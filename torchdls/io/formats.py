@@ -6,8 +6,6 @@ import logging
 import math
 import os
 import stat
-import struct
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
@@ -19,6 +17,7 @@ import numpy as np
 from torchdls._files import Array, naming, require
 from torchdls.io.containers import RATIO, check_declared, open_npz, read_npy
 from torchdls.io.matlab import open_mat
+from torchdls.io.png import check_png
 
 _JPEG, _TIFF = (b"\xff\xd8",), (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 SIGNATURES: dict[str, tuple[bytes, ...]] = {
@@ -69,10 +68,10 @@ def read_file(path: Path, suffixes: Sequence[str]) -> Array | Mapping[str, Array
 def _read_picture(path: Path, head: bytes) -> Array:
     # kornia keeps the 16 bits that imageio, scikit-image and Pillow drop from colours; Pillow is exact for the others.
     depth, color = (head[24], head[25]) if path.suffix.lower() == ".png" and len(head) > 25 else (8, 2)
-    if depth == 16 and color in (2, 6):
+    if depth >= 8 and color in (0, 2, 6) and path.suffix.lower() == ".png":
         from kornia.io import ImageLoadType, load_image
 
-        _check_png(path)
+        check_png(path)
         return np.asarray(load_image(path, ImageLoadType.UNCHANGED).permute(1, 2, 0).numpy())
     if depth == 16 and color == 4:
         raise ValueError("16-bit gray with alpha is not supported; store gray or RGBA")
@@ -95,40 +94,9 @@ def _read_picture(path: Path, head: bytes) -> Array:
     return pixels if pixels.ndim == 3 else pixels[..., None]
 
 
-def _check_png(path: Path) -> None:
-    """ValueError unless chunks, checksums and compressed data of a 16-bit colour PNG are whole.
-
-    The decoder of 16 bits trusts its input, so nothing is handed to it that does not unpack to exactly its size.
-    """
-    content = path.read_bytes()
-    data, at, header = [], 8, b""
-    while at + 12 <= len(content):
-        (size,) = struct.unpack(">I", content[at : at + 4])
-        body, kind = content[at + 8 : at + 8 + size], content[at + 4 : at + 8]
-        if len(body) < size or zlib.crc32(kind + body) != int.from_bytes(content[at + 8 + size : at + 12 + size]):
-            raise ValueError(f"chunk {kind.decode('latin-1')!r} is cut or damaged")
-        header = body if kind == b"IHDR" else header
-        data += [body] if kind == b"IDAT" else []
-        at += 12 + size
-        if kind == b"IEND":
-            break
-    else:
-        raise ValueError("its end is missing")
-    width, height, _, color, compression, filtering, interlace = struct.unpack(">IIBBBBB", header)
-    if not width or not height or compression or filtering or interlace:
-        raise ValueError("it is interlaced, or its header is damaged")
-    row = 1 + 2 * (3 if color == 2 else 4) * width
-    packed = b"".join(data)
-    check_declared(row * height, len(packed))
-    unpack = zlib.decompressobj()
-    raw = unpack.decompress(packed, row * height + 1)
-    if len(raw) != row * height or max(raw[::row]) > 4:
-        raise ValueError("its compressed data is not whole")
-
-
 def _read_tiff(path: Path) -> Array:
     tifffile: Any = require("tifffile", "files")
-    with _silent("tifffile"), tifffile.TiffFile(path) as file:
+    with silent("tifffile"), tifffile.TiffFile(path) as file:
         series = file.series[0]
         plain = all(page.compression == 1 for page in series.pages if page is not None)
         check_declared(math.prod(series.shape) * series.dtype.itemsize, os.path.getsize(path), 1 if plain else RATIO)
@@ -141,7 +109,7 @@ def _read_tiff(path: Path) -> Array:
 
 
 @contextmanager
-def _silent(name: str) -> Iterator[None]:
+def silent(name: str) -> Iterator[None]:
     """Nothing of what a reader logs: the error that follows says it in one line."""
     logger = logging.getLogger(name)
     level = logger.level

@@ -26,7 +26,7 @@ from torchdls._files import (
     single_map,
 )
 from torchdls.geometry import height_to_points
-from torchdls.io.formats import read_file
+from torchdls.io.formats import read_file, silent
 from torchdls.io.meshes import MESH_SUFFIXES, save_mesh
 
 OUTPUT_SUFFIXES = (".npz", ".npy", ".tiff", ".tif", ".png", *MESH_SUFFIXES)
@@ -52,15 +52,13 @@ def load_height(path: str | os.PathLike[str]) -> HeightMap:
         pixel_size = pair(path, content["pixel_size"]) if "pixel_size" in content else pixel_size
         content = content[one_of(path, content, ("height", "depth"))]
     elif path.suffix.lower() == ".png":
-        notes = _png_notes(path)
+        notes, codes = _png_notes(path), content.reshape(content.shape[:2])
         pixel_size = pair(path, notes["pixel_size"])
-        codes = content.reshape(content.shape[:2])
-        content = np.where(
-            codes == notes["invalid"], np.nan, notes["offset"] + notes["scale"] * codes.astype(np.float64)
-        )
+        height = notes["offset"] + notes["scale"] * codes.astype(np.float64)
+        content = np.where(codes == notes["invalid"], np.nan, height)
     elif path.suffix.lower() != ".npy":
         pixel_size = pair(path, _tiff_notes(path).get("pixel_size", pixel_size))
-    if content.ndim != 2 or content.dtype.kind != "f":
+    if content.ndim != 2 or content.dtype.kind != "f" or not content.size:
         raise ValueError(f"{path}: {content.dtype} of shape {content.shape} is no height, floats (H, W) are needed")
     height = as_tensor(content)[None, None]
     return HeightMap(height, height.isfinite(), pixel_size)
@@ -141,11 +139,15 @@ def _png_notes(path: Path) -> dict[str, Any]:
     with naming(path, "PNG"), Image.open(path) as image:
         if "torchdls" not in image.info:
             raise ValueError("it has no text chunk `torchdls` that says what its codes mean")
-        return dict(json.loads(image.info["torchdls"]))
+        notes = json.loads(image.info["torchdls"])
+        numbers = {name: float(notes[name]) for name in ("offset", "scale", "invalid")}
+        return {"pixel_size": notes["pixel_size"], **numbers}
 
 
 def _tiff_notes(path: Path) -> dict[str, Any]:
     tifffile = require("tifffile", "files")
-    with tifffile.TiffFile(path) as file, suppress(ValueError):
-        return dict(json.loads(file.pages[0].description))
+    with naming(path, "TIFF"), silent("tifffile"), tifffile.TiffFile(path) as file:
+        description = file.pages[0].description
+    with suppress(ValueError, TypeError):  # another program's words
+        return dict(json.loads(description))
     return {}
