@@ -1,30 +1,38 @@
-"""The integrators by name, without loading any of them: a name costs nothing until its class is asked for."""
+"""The integrators and learners by name, without loading any: a name costs nothing until its class is asked for."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator, Mapping
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from torchdls.dictionary import Learner
+    from torchdls.integrators import Integrator
+
+T = TypeVar("T")
 
 
-class Registry(Mapping[str, Any]):
+class Registry(Mapping[str, type[T]]):
     """A read-only table from names to classes of `torchdls`, each imported when it is looked up.
 
     Iterating, `len` and `in` import nothing, so that the command line can list the names before PyTorch is loaded.
 
     Args:
-        classes: name -> name of a class that `torchdls` exports.
+        classes: name -> name of a class that `torchdls` exports, or "package.module.Class" of any other.
     """
 
     def __init__(self, classes: Mapping[str, str]) -> None:
         self._classes = dict(classes)
 
-    def __getitem__(self, name: str) -> Any:
+    def __getitem__(self, name: str) -> type[T]:
         """The class of that name; KeyError, with the known names, if there is none."""
         if name not in self._classes:
             raise KeyError(f"{name!r} is unknown; choose from {', '.join(self)}")
-        return getattr(import_module("torchdls"), self._classes[name])
+        module, _, attribute = self._classes[name].rpartition(".")
+        found: type[T] = getattr(import_module(module or "torchdls"), attribute)
+        return found
 
     def __contains__(self, name: object) -> bool:
         return name in self._classes
@@ -38,6 +46,10 @@ class Registry(Mapping[str, Any]):
     def __repr__(self) -> str:
         return f"Registry({', '.join(self)})"
 
+    def name_of(self, wanted: type) -> str | None:
+        """The name of a class, or None if it is not in the table."""
+        return next((name for name, found in self.items() if found is wanted), None)
+
     def summary(self, name: str) -> str:
         """What the method is, in one line: the first of its docstring."""
         return (inspect.getdoc(self[name]) or "").partition("\n")[0]
@@ -47,7 +59,7 @@ class Registry(Mapping[str, Any]):
         return {p.name: p.default for p in inspect.signature(self[name]).parameters.values()}
 
 
-INTEGRATORS = Registry(
+INTEGRATORS: Registry[Integrator] = Registry(
     {
         "least_squares": "LeastSquares",
         "frankot_chellappa": "FrankotChellappa",
@@ -66,5 +78,15 @@ INTEGRATORS = Registry(
         "mumford_shah": "MumfordShah",
         "dls": "DLS",
         "slope_dls": "SlopeDLS",
+    }
+)
+
+LEARNERS: Registry[Learner] = Registry(
+    {
+        "soup_dil": "SoupDIL",
+        "k_svd": "KSVD",
+        "fixed": "FixedDictionary",
+        "dino_kat": "DinoKat",
+        "unitary": "Unitary",
     }
 )

@@ -1,7 +1,8 @@
 """Dictionaries of patches: initial dictionaries, sparse coding, and the learners (SOUP-DIL first among them)."""
 
+from torchdls._registry import LEARNERS
 from torchdls.dictionary.initial import dct_dictionary
-from torchdls.dictionary.learners import KSVD, LEARNERS, DinoKat, FixedDictionary, Learner, SoupDIL
+from torchdls.dictionary.learners import KSVD, DinoKat, FixedDictionary, Learner, SoupDIL
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import soup_dil_sweep
 from torchdls.dictionary.unitary import Unitary

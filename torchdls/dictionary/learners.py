@@ -19,7 +19,6 @@ from torch import Tensor
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
 from torchdls.dictionary.thresholds import Threshold
-from torchdls.dictionary.unitary import Unitary
 
 Step = tuple[Tensor, Tensor, Tensor]
 
@@ -197,13 +196,3 @@ def _replace_unused(D: Tensor, R: Tensor, B: Tensor) -> Tensor:
     rank = (unused.cumsum(1) - 1).clamp(0, count - 1)
     patches = R.gather(2, worst.gather(1, rank)[:, None].expand(-1, R.shape[1], -1))
     return torch.where(unused[:, None], _unit(patches, D), D)
-
-
-LEARNERS: dict[str, type[SoupDIL] | type[FixedDictionary] | type[DinoKat] | type[KSVD] | type[Unitary]] = {
-    "soup_dil": SoupDIL,
-    "k_svd": KSVD,
-    "fixed": FixedDictionary,
-    "dino_kat": DinoKat,
-    "unitary": Unitary,
-}
-"""The learners by name."""

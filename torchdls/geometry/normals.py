@@ -33,7 +33,7 @@ so the logarithm of the depth is integrated like a height, and its free constant
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -211,6 +211,9 @@ class NormalsToGradient(_Conversion):
         )
         return field.gradient
 
+    if TYPE_CHECKING:
+        __call__ = forward
+
 
 class GradientToNormals(_Conversion):
     """`gradient_to_normals` as a module: gradient (N, 2, H, W) in, unit normals (N, 3, H, W) out."""
@@ -218,6 +221,9 @@ class GradientToNormals(_Conversion):
     def forward(self, gradient: Tensor) -> Tensor:
         """Normals (N, 3, H, W) of a gradient (N, 2, H, W)."""
         return gradient_to_normals(gradient, self.convention, camera=self.camera, pixel_size=self.pixel_size)
+
+    if TYPE_CHECKING:
+        __call__ = forward
 
 
 def guess_convention(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from math import sqrt
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor, nn
 
+from torchdls._options import plain, same, shown
 from torchdls.integrators.data_term import edge_cost
 from torchdls.integrators.fields import Fields as Fields
 from torchdls.integrators.fields import check_accepted, check_gradient, check_values, fit_fields, within_mask
@@ -69,6 +72,33 @@ class Integrator(nn.Module):
         height = self.integrate(fields)
         height = height if self.unit == 1 else height * self.unit
         return height if gradient.ndim == 4 else height[0]
+
+    if TYPE_CHECKING:  # the call of `nn.Module` gives Any
+        __call__ = forward
+
+    def options(self) -> dict[str, Any]:
+        """The arguments of the constructor as plain data, with which `torchdls.build` makes the integrator again.
+
+        Returns:
+            Numbers, words, None and tuples; of a part such as a learner or a data term {"name": ..., option: value};
+            of a tensor, whose values live in the `state_dict`, the mark {"tensor": shape, "dtype": ..., "kind": ...}.
+
+        Raises:
+            TypeError: an option has no form as plain data, such as a learner that is no registered class.
+        """
+        return {name: plain(value) for name, value in self._arguments().items()}
+
+    def _arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor: each is kept as the attribute of its name."""
+        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
+
+    def __repr__(self) -> str:
+        """The call that makes it: every option that differs from its default."""
+        arguments, parameters = self._arguments(), inspect.signature(type(self)).parameters
+        needed = {name: arguments[name] for name, p in parameters.items() if p.default is p.empty}
+        defaults = type(self)(**needed)._arguments()
+        told = [n for n, value in arguments.items() if n in needed or not same(value, defaults[n])]
+        return f"{type(self).__name__}({', '.join(f'{name}={shown(arguments[name])}' for name in told)})"
 
     def integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels from checked fields; what a subclass provides."""

@@ -64,10 +64,6 @@ class FrankotChellappa(Integrator):
         spectrum = torch.fft.rfft2(gx) * (wx * inverse) + torch.fft.rfft2(gy) * (wy * inverse)
         return torch.fft.irfft2(spectrum * -1j, s=(rows, columns))[..., :h, :w]
 
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        return f"extension={self.extension!r}, pixel_size={self.pixel_size}"
-
 
 def _mirror(g: Tensor, odd: int, even: int) -> Tensor:
     """The slopes of the reflected surface: those across a reflection change sign."""

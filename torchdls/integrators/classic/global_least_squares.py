@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
@@ -41,11 +41,12 @@ class GlobalLeastSquares(Integrator):
                 f"{name}: degree={degree!r} given, an integer from 1 to support - 1 = {support - 1} is needed"
             )
         self.support = support
-        self.degree = support - 1 if degree is None else degree
+        self.degree = degree
+        self._degree = support - 1 if degree is None else degree
 
     def modes_of(self, n: int, step: float, dim: int, like: Tensor) -> Modes:
         """The eigenvectors of the rows (dim -2) or columns (dim -1), n of them; what a subclass may choose."""
-        return axis_modes(n, step, dim, self.support, self.degree, "cosine", n, 0.0, 1, like=like)
+        return axis_modes(n, step, dim, self.support, self._degree, "cosine", n, 0.0, 1, like=like)
 
     def integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
@@ -87,10 +88,6 @@ class HarkerOLeary(GlobalLeastSquares):
         self, support: int = 3, degree: int | None = None, *, pixel_size: float | Sequence[float] = 1.0
     ) -> None:
         super().__init__(support, degree, pixel_size)
-
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        return f"support={self.support}, degree={self.degree}, pixel_size={self.pixel_size}"
 
 
 class SpectralRegularization(GlobalLeastSquares):
@@ -144,12 +141,7 @@ class SpectralRegularization(GlobalLeastSquares):
         if count > n:
             sides = f"{n} {('rows', 'columns')[2 + dim]}"
             raise ValueError(f"SpectralRegularization: modes={asked} given for {sides}, at most as many are possible")
-        return axis_modes(n, step, dim, self.support, self.degree, self.basis, count, 0.0, 1, like=like)
-
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        shape = f"support={self.support}, degree={self.degree}"
-        return f"modes={self.modes}, basis={self.basis!r}, {shape}, pixel_size={self.pixel_size}"
+        return axis_modes(n, step, dim, self.support, self._degree, self.basis, count, 0.0, 1, like=like)
 
 
 class TikhonovRegularization(GlobalLeastSquares):
@@ -204,7 +196,7 @@ class TikhonovRegularization(GlobalLeastSquares):
     def modes_of(self, n: int, step: float, dim: int, like: Tensor) -> Modes:
         """The eigenvectors of D^T D + lam S^T S."""
         lam = _number(self.lam)
-        return axis_modes(n, step, dim, self.support, self.degree, "cosine", n, lam, self.order, like=like)
+        return axis_modes(n, step, dim, self.support, self._degree, "cosine", n, lam, self.order, like=like)
 
     def integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels.
@@ -260,6 +252,9 @@ class TikhonovRegularization(GlobalLeastSquares):
         height = (z0 + self.integrate(rest)) * self.unit
         return height if gradient.ndim == 4 else height[0]
 
+    if TYPE_CHECKING:
+        __call__ = forward
+
     def _prior(self, prior: Tensor, gradient: Tensor) -> Tensor:
         name = type(self).__name__
         fitted = cast(Tensor, fit_field(name, "prior", prior, gradient, channels=(1,)))
@@ -270,21 +265,16 @@ class TikhonovRegularization(GlobalLeastSquares):
     def _slopes(self, z: Tensor, steps: tuple[float, float]) -> Tensor:
         """(N, 2, H, W) slopes Z D_x^T and D_y Z."""
         (h, w), (dx, dy) = z.shape[-2:], steps
-        columns = derivative_matrix(w, self.support, self.degree, dx, like=z)
-        rows = derivative_matrix(h, self.support, self.degree, dy, like=z)
+        columns = derivative_matrix(w, self.support, self._degree, dx, like=z)
+        rows = derivative_matrix(h, self.support, self._degree, dy, like=z)
         return torch.cat([z @ columns.mT, rows @ z], -3)
 
     def _powers(self, z: Tensor, steps: tuple[float, float]) -> tuple[Tensor, Tensor]:
         """Z S_x^T S_x and S_y^T S_y Z."""
         (h, w), (dx, dy) = z.shape[-2:], steps
-        columns = derivative_matrix(w, self.support, self.degree, dx, like=z).matrix_power(self.order)
-        rows = derivative_matrix(h, self.support, self.degree, dy, like=z).matrix_power(self.order)
+        columns = derivative_matrix(w, self.support, self._degree, dx, like=z).matrix_power(self.order)
+        rows = derivative_matrix(h, self.support, self._degree, dy, like=z).matrix_power(self.order)
         return z @ columns.mT @ columns, rows.mT @ (rows @ z)
-
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        shape = f"support={self.support}, degree={self.degree}"
-        return f"lam={_number(self.lam):g}, order={self.order}, {shape}, pixel_size={self.pixel_size}"
 
 
 def _is_count(modes: object) -> bool:

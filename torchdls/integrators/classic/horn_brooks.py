@@ -83,9 +83,3 @@ class HornBrooks(Integrator):
             message = f"HornBrooks: {int(active.sum())} of {len(b)} surfaces above tol={self.tol:g}"
             warnings.warn(f"{message} after {self.max_iter} iterations", ConvergenceWarning, stacklevel=2)
         return free_constants(w.detach(), r.expand_as(z).detach()).remove(z)
-
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        return (
-            f"tol={self.tol:g}, max_iter={self.max_iter}, relaxation={self.relaxation:g}, pixel_size={self.pixel_size}"
-        )

@@ -77,7 +77,3 @@ class LeastSquares(Integrator):
             z0=z0,
             pixel_size=fields.steps,
         )
-
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        return f"tol={self.tol:g}, max_iter={self.max_iter}, boundary={self.boundary!r}, pixel_size={self.pixel_size}"

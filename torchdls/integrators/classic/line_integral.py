@@ -45,7 +45,3 @@ class LineIntegral(Integrator):
         column_first = x + (y - x).mean(-1, keepdim=True)
         z = (row_first + column_first) / 2
         return z - z.mean((-2, -1), keepdim=True)
-
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        return f"pixel_size={self.pixel_size}"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchdls._tracing import taped, visible
 from torchdls.dictionary import dct_dictionary
@@ -372,7 +372,25 @@ class DLS(Iterative[DLSResult]):
             cost = cost + 0.5 * (fields.anchor_weight * (z - fields.anchor).square()).sum((-3, -2, -1))
         return cost + model.lam * patch_cost(state.R, state.B, model.mu, model.valid, self.threshold)
 
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        names = ("lam", "mu", "n_iter", "z_step", "learner", "learn", "threshold", "grad", "tol", "pixel_size")
-        return f"{self.patches}, " + ", ".join(f"{n}={getattr(self, n)!r}" for n in names)
+    @property
+    def patch_size(self) -> int | tuple[int, int]:
+        """Rows and columns of a patch."""
+        return self.patches.size
+
+    @property
+    def stride(self) -> int | tuple[int, int]:
+        """Step between patches, down and to the right."""
+        return self.patches.stride
+
+    @property
+    def n_atoms(self) -> int:
+        """K, the number of atoms."""
+        return self.dictionary.shape[-1]
+
+    def _arguments(self) -> dict[str, Any]:
+        arguments = super()._arguments()
+        if not isinstance(self.dictionary, nn.Parameter):
+            cosines = dct_dictionary(self.patch_size, self.n_atoms).to(self.dictionary)
+            if torch.equal(cosines, self.dictionary):
+                arguments["dictionary"] = None
+        return arguments

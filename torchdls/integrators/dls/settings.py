@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 from torch import Tensor, nn
 
-from torchdls.dictionary.learners import LEARNERS, Learner, SoupDIL
+from torchdls._registry import LEARNERS
+from torchdls.dictionary.learners import Learner, SoupDIL
 from torchdls.dictionary.soup_dil import Order, Unused
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold
 

@@ -146,10 +146,6 @@ class AnisotropicDiffusion(Robust):
         steep = rise > 0
         return z + torch.where(steep, fall / torch.where(steep, rise, 1), 0) * direction, direction, fall
 
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        return f"beta={self.beta:g}, contrast={self.contrast!r}, {super().extra_repr()}"
-
 
 def _anchored(fields: Fields, z: Tensor) -> Tensor | float:
     """(N,) sum of r z^2."""

@@ -124,10 +124,6 @@ class Robust(Iterative[RobustResult]):
         guess = None if z0 is None else z0.detach()
         return solve(v, w, fields.anchor, anchor_weight, tol=self.solve_tol, z0=guess, pixel_size=fields.steps).height
 
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        return f"n_iter={self.n_iter}, tol={self.tol:g}, pixel_size={self.pixel_size}"
-
 
 def choose(active: Tensor, new: Tensor, old: Tensor) -> Tensor:
     """The new value where a surface is still active."""

@@ -122,10 +122,6 @@ class _Linear(Convex):
         noise = sample_noise(fields)[..., None]
         return Penalty(Terms.of(fields, joint=self.joint), noise, self.smoothing * noise)
 
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        return f"smoothing={self.smoothing:g}, {super().extra_repr()}"
-
 
 class TotalVariation(_Linear):
     r"""Total variation of the residual field, isotropic: edges stay sharp and outliers do no harm.
@@ -225,10 +221,6 @@ class Huber(Convex):
         """Huber's penalty of the residuals."""
         corner = level(self.delta, _HUBER, fields)
         return Penalty(Terms.of(fields, joint=False), corner, corner)
-
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        return f"delta={self.delta!r}, {super().extra_repr()}"
 
 
 def positive_or_auto(method: str, name: str, value: float | str) -> float | str:

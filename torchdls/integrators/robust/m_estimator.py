@@ -115,10 +115,6 @@ class MEstimator(Robust):
     def _begin(self, fields: Fields, data: DataTerm) -> State:
         return (huber_start(self, fields),)
 
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        return f"loss={self.loss!r}, scale={self.scale!r}, floor={self.floor:g}, {super().extra_repr()}"
-
 
 def huber_start(method: Robust, fields: Fields) -> Tensor:
     """The convex surface of `Huber`, nearly, from which the objectives that are not convex start."""

@@ -134,7 +134,3 @@ class MumfordShah(Robust):
         s = data.indicator(data.misfit((height if height.ndim == 4 else height[None]) / self.unit))
         s = s if data.inside is None else torch.where(data.inside, s, 0)
         return s if height.ndim == 4 else s[0]
-
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        return f"kappa={self.kappa!r}, width={self.width:g}, floor={self.floor:g}, {super().extra_repr()}"

@@ -78,11 +78,6 @@ class WeightedLeastSquares(LeastSquares):
         number = _beside(cells.to(curl.dtype)).clamp(min=1)
         return (1 + _beside(badness) / number).square().reciprocal() + self.floor
 
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        settings = f"threshold={self.threshold:g}, floor={self.floor:g}, tol={self.tol:g}, max_iter={self.max_iter}"
-        return f"{settings}, pixel_size={self.pixel_size}"
-
 
 def _beside(cells: Tensor) -> Tensor:
     """Sum of a cell field (N, H - 1, W - 1) over the two cells beside each edge: (N, 2, H, W)."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Self
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchdls._tracing import visible
 from torchdls.integrators.base import Fields
@@ -96,6 +96,8 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
     Johnstone (1994), the shifts after Coifman, Donoho (1995), "Translation-invariant de-noising".
     """
 
+    sigma: float | Tensor | None
+
     def __init__(
         self,
         patch_sizes: Sequence[int] = (8, 24, 48),
@@ -124,7 +126,11 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         if sigma is not None and not bool((torch.as_tensor(sigma) >= 0).all()):
             raise ValueError(f"SlopeDLS: sigma={sigma!r} given, at least 0 is needed")
         self.tau, self.n_iter, self.learn, self.aggregate = tau, n_iter, learn, aggregate
-        self.sigma, self.guard, self.robust, self.z_tol = sigma, guard, robust, z_tol
+        self.guard, self.robust, self.z_tol = guard, robust, z_tol
+        if isinstance(sigma, Tensor) and not isinstance(sigma, nn.Parameter):
+            self.register_buffer("sigma", sigma.detach().clone())
+        else:
+            self.sigma = sigma
 
     @classmethod
     def fast(cls, **options: Any) -> Self:
@@ -229,11 +235,6 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         start, moved = (self._height(f, *self.edges(f), None) for f in (fields, fields._replace(gradient=n)))
         change = (self._run(probed, noise).height - z) / step
         return torch.where(noise.even, sure_guard(z, start, change, moved, noise.overall), z)
-
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        names = ("patch_sizes", "tau", "n_iter", "learn", "guard", "robust", "aggregate", "pixel_size")
-        return ", ".join(f"{n}={getattr(self, n)!r}" for n in names)
 
 
 def _continue(fields: Fields, z: Tensor, w: Tensor | None, tol: float) -> tuple[Tensor | None, Tensor]:

@@ -1,0 +1,62 @@
+"""Options as plain data: what a method was made with, in numbers, words, tuples and dicts, and as `repr` shows it.
+
+A part such as a learner or a data term becomes {"name": its name in the tables, option: value, ...}. A tensor becomes
+{"tensor": its shape, "dtype": ..., "kind": "buffer", "parameter" or "frozen parameter"}: a mark, since its values live
+in the `state_dict` of the module.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchdls._registry import INTEGRATORS, LEARNERS, Registry
+
+TABLES: tuple[Registry[Any], ...] = (INTEGRATORS, LEARNERS)
+
+
+def plain(value: Any) -> Any:
+    """The value of an option as plain data; TypeError for what has no such form."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, list | tuple):
+        return tuple(map(plain, value))
+    if isinstance(value, Tensor):
+        return {"tensor": tuple(value.shape), "dtype": str(value.dtype).removeprefix("torch."), "kind": _kind(value)}
+    name = part_name(type(value))
+    if name in INTEGRATORS:
+        return {"name": name, **value.options()}
+    if name is not None and is_dataclass(value):
+        return {"name": name} | {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+    raise TypeError(f"a {type(value).__name__} has no form as plain data; registered parts, numbers and words have")
+
+
+def part_name(kind: type[Any]) -> str | None:
+    """The name of a class in the tables."""
+    return next((name for table in TABLES if (name := table.name_of(kind)) is not None), None)
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two values of an option are equal; tensors by value, modules by their options."""
+    if isinstance(a, Tensor) or isinstance(b, Tensor):
+        return isinstance(a, Tensor) and isinstance(b, Tensor) and _kind(a) == _kind(b) and torch.equal(a, b)
+    if isinstance(a, nn.Module) and isinstance(b, nn.Module):
+        return type(a) is type(b) and repr(a) == repr(b)
+    return bool(a == b)
+
+
+def shown(value: Any) -> str:
+    """The value of an option in a few words: of a tensor with more than one number, the shape."""
+    if not isinstance(value, Tensor):
+        return repr(value)
+    content = f"{value.item():g}" if value.numel() == 1 else "x".join(map(str, value.shape))
+    return f"{type(value).__name__}({content})"
+
+
+def _kind(value: Tensor) -> str:
+    if not isinstance(value, nn.Parameter):
+        return "buffer"
+    return "parameter" if value.requires_grad else "frozen parameter"

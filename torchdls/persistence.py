@@ -1,0 +1,146 @@
+"""Integrators made from plain data, and kept in files: one safetensors file, without pickle.
+
+The tensors of the file are the `state_dict` of the integrator; its metadata hold "format" (`torchdls.integrator`),
+"version" (of the format), "torchdls" (the version that wrote it) and "integrator": the name and options, as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor, nn
+
+import torchdls
+from torchdls._files import atomic_file, check_output, naming, require
+from torchdls._options import TABLES
+from torchdls._registry import INTEGRATORS, Registry
+from torchdls.integrators import Integrator
+
+FORMAT, VERSION = "torchdls.integrator", 1
+_SUFFIX = ".safetensors"
+Tables = tuple[Registry[Any], ...]
+Tensors = dict[str, Tensor]
+
+
+def build(name: str, **options: Any) -> Integrator:
+    """The integrator of that name with these options, as `Integrator.options` gives them.
+
+    `build(name, **integrator.options())` makes an integrator again, as long as none of its options is a tensor: pass
+    those beside the others, or keep the integrator by `save`.
+
+    Args:
+        name: in `INTEGRATORS`.
+        options: of the class. A part may be given as {"name": "k_svd", "n_nonzero": 4}.
+
+    Raises:
+        ValueError: the name, the name of a part, or an option is unknown, or out of its range; or an option is the
+            mark of a tensor, which holds no values.
+
+    Example:
+        >>> build("dls", learner={"name": "k_svd", "n_nonzero": 4}, n_iter=10)
+        DLS(learner=KSVD(n_nonzero=4, steps=1), n_iter=10)
+    """
+    return _make((INTEGRATORS,), {"name": name, **options}, None)
+
+
+def save(path: str | os.PathLike[str], integrator: Integrator, *, overwrite: bool = False) -> None:
+    """Keep an integrator in a file: its name, its options and its tensors with their dtype, trained ones included.
+
+    Args:
+        path: ends in `.safetensors`; the file is whole or not there.
+        integrator: of a class in `INTEGRATORS`.
+        overwrite: replace a file.
+
+    Raises:
+        ValueError: the suffix or the class is another, or a part is not in the tables.
+        TypeError: an option has no form as plain data.
+        FileNotFoundError: the directory does not exist.
+        FileExistsError: the file exists and `overwrite` is False.
+        ImportError: safetensors is not installed.
+    """
+    path = check_output(path, overwrite, suffixes=[_SUFFIX])
+    name = INTEGRATORS.name_of(type(integrator))
+    if name is None:
+        raise ValueError(f"save: {type(integrator).__name__} is not one of {', '.join(INTEGRATORS)}")
+    described = json.dumps({"name": name, "options": integrator.options()})
+    metadata = {"format": FORMAT, "version": str(VERSION), "torchdls": torchdls.__version__, "integrator": described}
+    tensors = {key: t.detach().cpu().contiguous().clone() for key, t in integrator.state_dict().items()}
+    data: bytes = require("safetensors.torch", "files").save(tensors, metadata)
+    with atomic_file(path, overwrite) as file:
+        file.write(data)
+
+
+def load(path: str | os.PathLike[str]) -> Integrator:
+    """The integrator that `save` kept, on the CPU.
+
+    Raises:
+        ValueError: the file is of another kind, damaged, of a newer version, of an integrator or option that is
+            unknown, or its tensors are not those of the integrator. The message names the file.
+        FileNotFoundError: there is no such file.
+        ImportError: safetensors is not installed.
+    """
+    path = Path(path)
+    metadata, tensors = _read(path)
+    if metadata.get("format") != FORMAT:
+        raise ValueError(f"{path}: holds no integrator of torchdls")
+    version = metadata.get("version", "")
+    if not version.isdecimal() or int(version) > VERSION:
+        raise ValueError(f"{path}: has version {version!r} of the format, this torchdls reads up to {VERSION}")
+    with naming(path, "an integrator"):
+        description = json.loads(metadata["integrator"])
+        integrator = _make((INTEGRATORS,), {"name": description["name"], **description["options"]}, tensors)
+        _check_tensors(integrator.state_dict(), tensors)
+        integrator.load_state_dict(tensors, assign=True)
+    return integrator
+
+
+def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    safetensors = require("safetensors", "files")
+    with naming(path, "safetensors"), safetensors.safe_open(path, "pt") as file:
+        return file.metadata() or {}, {key: file.get_tensor(key).clone() for key in file.keys()}  # noqa: SIM118
+
+
+def _check_tensors(wanted: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:
+    if missing := wanted.keys() - found.keys():
+        raise ValueError(f"lacks the tensors {', '.join(sorted(missing))}")
+    if extra := found.keys() - wanted.keys():
+        raise ValueError(f"holds tensors that the integrator has not: {', '.join(sorted(extra))}")
+    for key, t in wanted.items():
+        if t.shape != found[key].shape:
+            raise ValueError(f"{key}: shape {tuple(found[key].shape)} given, {tuple(t.shape)} is needed")
+
+
+def _make(tables: tuple[Registry[Any], ...], part: dict[str, Any], tensors: Tensors | None, at: str = "") -> Any:
+    """The integrator or part of a dict {"name": ..., option: value}."""
+    options = dict(part)
+    name = options.pop("name")
+    table = next((table for table in tables if name in table), None)
+    if table is None:
+        raise ValueError(f"{name!r} is unknown; choose from {', '.join(n for table in tables for n in table)}")
+    known = table.parameters(name)
+    if unknown := options.keys() - known.keys():
+        raise ValueError(f"{name}: no option {', '.join(sorted(unknown))}; it has {', '.join(known)}")
+    return table[name](**{key: _value(value, tensors, f"{at}{key}") for key, value in options.items()})
+
+
+def _value(value: Any, tensors: Tensors | None, at: str) -> Any:
+    """The value of an option from its plain form; `at` is its place in the state_dict."""
+    if isinstance(value, list | tuple):
+        return tuple(_value(v, tensors, at) for v in value)
+    if not isinstance(value, dict):
+        return value
+    if "tensor" not in value and "name" not in value:
+        raise ValueError(f"{at}: a dict without 'name' given, such as {{'name': 'k_svd', 'n_nonzero': 4}} is needed")
+    if "tensor" not in value:
+        return _make(TABLES, value, tensors, f"{at}.")
+    if tensors is None:
+        raise ValueError(f"{at}: this is the mark of a tensor, not its values; pass the tensor itself, or use `load`")
+    if at not in tensors:
+        raise ValueError(f"lacks the tensors {at}")
+    if value.get("kind") == "buffer":
+        return tensors[at]
+    return nn.Parameter(tensors[at], requires_grad=value.get("kind") == "parameter")
