@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from torchdls import plot
 
@@ -56,7 +57,7 @@ def test_hillshade_keeps_the_outside_blank():
 
 
 def texts(figure: Figure):
-    return [t.get_text() for t in figure.findobj(lambda artist: hasattr(artist, "get_text"))]
+    return [t.get_text() for t in figure.findobj(Text)]
 
 
 @pytest.mark.parametrize("with_slopes", [False, True])

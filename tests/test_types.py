@@ -1,5 +1,6 @@
 """What a type checker tells a caller."""
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -36,7 +37,7 @@ def call(g: Tensor, normals: Tensor, mask: Tensor) -> None:
 
 # Each line alone is an error.
 WRONG = {
-    'DLS()("slopes")': 'Argument 1 has incompatible type "str"; expected "Tensor"',
+    'DLS()("slopes")': 'Argument 1 to "__call__" of "Integrator" has incompatible type "str"; expected "Tensor"',
     "LeastSquares()(g, masque=g)": 'Unexpected keyword argument "masque"',
     "NormalsToGradient()(normals, g)": "Too many arguments",
     "GradientToNormals()(g).height": '"Tensor" has no attribute "height"',
@@ -70,3 +71,17 @@ def test_calls_have_types_and_mistakes_are_errors(tmp_path: Path) -> None:
     for number, (line, message) in enumerate(WRONG.items(), first):
         assert any(error.startswith(f"{number}: error: {message}") for error in found), (line, found)
     assert {int(error.partition(":")[0]) for error in found} == set(range(first, first + len(WRONG))), found
+
+
+def test_the_call_is_declared_as_forward_is() -> None:
+    seen = []
+    for path in (ROOT / "torchdls").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                inner = [n for part in node.body for n in (part.body if isinstance(part, ast.If) else [part])]
+                found = {n.name: n for n in inner if isinstance(n, ast.FunctionDef)}
+                if {"forward", "__call__"} <= found.keys():
+                    call, forward = found["__call__"], found["forward"]
+                    assert ast.unparse(call.args) == ast.unparse(forward.args), node.name
+                    seen.append(node.name)
+    assert {"Integrator", "TikhonovRegularization", "NormalsToGradient", "GradientToNormals"} <= {*seen}

@@ -24,8 +24,8 @@ from .geometry import normals_to_gradient as normals_to_gradient
 from .integrators import DLS as DLS
 from .integrators import INTEGRATORS as INTEGRATORS
 from .integrators import L1 as L1
-from .integrators import Bilateral as Bilateral
 from .integrators import AnisotropicDiffusion as AnisotropicDiffusion
+from .integrators import Bilateral as Bilateral
 from .integrators import DLSResult as DLSResult
 from .integrators import FrankotChellappa as FrankotChellappa
 from .integrators import HarkerOLeary as HarkerOLeary
@@ -85,4 +85,5 @@ from .surfaces import SURFACES as SURFACES
 from .surfaces import Surface as Surface
 from .surfaces import terrain as terrain
 
+__all__: list[str]
 __version__: str

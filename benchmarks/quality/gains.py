@@ -35,7 +35,7 @@ from torchdls import (
 )
 from torchdls.metrics import mean_angular_error, rmse, ssim
 from torchdls.noise import noise_level
-from torchdls.solvers.poisson import solve_direct
+from torchdls.solvers import solve_direct
 from torchdls.surfaces import terrain
 
 MEASURES = ("rmse", "1-ssim", "1-ssim, full range", "gradient", "angle")

@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from quality import PAPER, SNRS, Case
 from torch import Tensor
 
 from benchmarks.common.paper_figures import comparison, photometric_figure, sweep_plot
 from benchmarks.common.report import markdown_table, results_folder, write_json
+from benchmarks.quality.dls import PAPER, SNRS, Case
 from torchdls import DLS, INTEGRATORS, noise_level
 
 # The columns of the paper, by the names of the registry; the paper's figures for SNRS.

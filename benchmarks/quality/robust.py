@@ -42,7 +42,7 @@ def cases(size: int) -> dict[str, tuple[Tensor, Tensor]]:
 
 def settling(g: Tensor, name: str, reference: int) -> dict[str, float]:
     """Iterations until the objective stays within 1 % of the best of a long run, and the excess of the defaults."""
-    method = torchdls.INTEGRATORS[name]
+    method: Any = torchdls.INTEGRATORS[name]
     long = method(n_iter=reference, tol=0).solve(g).objective[0]
     excess = long / long.min() - 1
     late = (excess > 0.01).nonzero()

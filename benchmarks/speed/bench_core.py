@@ -66,10 +66,11 @@ def test_anchored_solve(benchmark, n, size):
 def test_sweep(benchmark, n, size, order):
     P = Patches().extract(LeastSquares()(field(n, size, torch.float32)))
     D = dct_dictionary(8, 64).expand(n, -1, -1)
-    state = [P.clone(), D, torch.zeros(n, 64, P.shape[-1])]
+    state = P.clone(), D, torch.zeros(n, 64, P.shape[-1])
 
     def run():
-        state[:] = residual_sweep(*state, 0.2, order=order)
+        nonlocal state
+        state = residual_sweep(*state, 0.2, order=order)
 
     benchmark(run)
 

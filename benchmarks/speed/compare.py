@@ -212,7 +212,8 @@ def error_curve(size: int, passes: tuple[int, ...]) -> list[tuple[Any, ...]]:
                 D, B = soup_dil_sweep(P, D, B, mu, order="block")
             return D[0].numpy()
 
-        runs = {"sweep": sweeps, "SPAMS": partial(spams_dictionary, spams, X, start, n, torch.get_num_threads())}
+        spams_run = partial(spams_dictionary, spams, X, start, n, torch.get_num_threads())
+        runs: dict[str, Callable[[], Any]] = {"sweep": sweeps, "SPAMS": spams_run}
         seconds = {name: median(t) for name, t in interleaved(runs, 0.0).items()}
         errors = {name: spams_error(spams, X, run()) for name, run in runs.items()}
         rows.append((n, seconds["sweep"], errors["sweep"], seconds["SPAMS"], errors["SPAMS"]))

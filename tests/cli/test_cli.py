@@ -168,7 +168,7 @@ def test_perspective_plane_comes_back_as_depth(tmp_path, as_file):
     np.testing.assert_allclose(depth / depth.mean(), exact / exact.mean(), rtol=2e-4)
     import trimesh
 
-    mesh = trimesh.load(outs[1], force="mesh")
+    mesh = trimesh.load_mesh(outs[1])
     normals = mesh.face_normals * [1, -1, -1]  # back to the camera's frame
     np.testing.assert_allclose(normals, np.broadcast_to(n[0, :, 0, 0] / n[0, :, 0, 0].norm(), normals.shape), atol=0.01)
 

@@ -156,9 +156,9 @@ def test_hard_threshold_by_brute_force():
         cost = (b - x).square() + penalty(b, torch.tensor(mu, dtype=x.dtype))
         torch.testing.assert_close(cost, costs.amin(0))
         assert b.abs().max() <= bound
-    mu = torch.tensor(1.0)
+    level = torch.tensor(1.0)
     edge = torch.tensor([1.0, -1.0, 1.0 + 1e-6, -1.0 - 1e-6])
-    assert (shrink(edge, mu) != 0).tolist() == [False, False, True, True]
+    assert (shrink(edge, level) != 0).tolist() == [False, False, True, True]
 
 
 def test_float32_keeps_up_with_float64():

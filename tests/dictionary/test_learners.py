@@ -39,7 +39,7 @@ def cost(R, B, mu):
     return R.square().sum((1, 2)) + mu**2 * (B != 0).sum((1, 2))
 
 
-def start(P, D):
+def start(P, D) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return P.clone(), D.clone(), P.new_zeros(len(P), D.shape[-1], P.shape[-1])
 
 

@@ -4,6 +4,7 @@ import copy
 import io
 import pickle
 import warnings
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from torch.nn.utils import parametrize
 from tests.helpers import random_field
 from torchdls import DLS, INTEGRATORS, LeastSquares, NormalsToGradient, soup_dil_sweep
 
-SMALL = {"patch_size": 4, "n_atoms": 16, "n_iter": 3, "tol": 0.0}
+SMALL: dict[str, Any] = {"patch_size": 4, "n_atoms": 16, "n_iter": 3, "tol": 0.0}
 quiet = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
 
 
@@ -136,7 +137,7 @@ def test_compiles_without_a_break() -> None:
         a = GradientOperator()
         return solve_direct(a.adjoint(w * a(x)), None)
 
-    cases = [
+    cases: list[tuple[Any, tuple[Tensor, ...]]] = [
         (LeastSquares(), (g,)),
         (lambda P, D, B: soup_dil_sweep(P, D, B, 0.5), (P, D, B)),
         (step, (g[:, :1], g.abs())),

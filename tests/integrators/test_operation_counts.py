@@ -18,7 +18,9 @@ class Operations(TorchDispatchMode):
 
     def __init__(self, large):
         super().__init__()
-        self.count, self.large, self.least = Counter(), Counter(), large
+        self.count: Counter[str] = Counter()
+        self.large: Counter[str] = Counter()
+        self.least = large
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         out = func(*args, **(kwargs or {}))

@@ -1,6 +1,7 @@
 """Files are checked against other libraries' readers and writers, and against closed forms."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -157,7 +158,8 @@ def test_masks_in_every_form(tmp_path, form):
 def test_camera(tmp_path, suffix):
     k = np.array([[500, 0, 32.5], [0, 510, 24], [0, 0, 1]])
     path = tmp_path / f"k.{suffix}"
-    {"npy": np.save, "txt": np.savetxt, "npz": lambda p, k: np.savez(p, K=k)}[suffix](path, k)
+    writers: dict[str, Any] = {"npy": np.save, "txt": np.savetxt, "npz": lambda p, k: np.savez(p, K=k)}
+    writers[suffix](path, k)
     np.testing.assert_array_equal(io.load_camera(path), k)
 
 
@@ -183,7 +185,7 @@ def test_png_says_what_its_codes_mean(tmp_path):
     height = bowl()
     io.save_height(tmp_path / "z.png", height)
     with Image.open(tmp_path / "z.png") as image:
-        codes, notes = np.asarray(image).astype(np.float64), json.loads(image.text["torchdls"])
+        codes, notes = np.asarray(image).astype(np.float64), json.loads(image.info["torchdls"])
     assert codes.min() == 1
     assert codes.max() == 65535
     np.testing.assert_allclose(notes["offset"] + notes["scale"] * codes, height, atol=notes["scale"])
@@ -212,7 +214,7 @@ def test_meshes(tmp_path, suffix):
     mask[0, 0] = mask[4, 5] = False
     path = tmp_path / f"z.{suffix}"
     io.save_height(path, bowl(), mask=mask, pixel_size=(0.5, 2.0))
-    mesh = trimesh.load(path, force="mesh")
+    mesh = trimesh.load_mesh(path)
     assert len(mesh.vertices) == 33
     # 24 cells of 2 triangles; the corner's cell loses one, the two cells at the gap lose one each.
     assert len(mesh.faces) == 48 - 3
@@ -231,7 +233,7 @@ def test_mesh_of_given_points_covers_the_mask(tmp_path):
     io.save_mesh(tmp_path / "p.ply", points[None])
     cells = sum(mask[i : i + 19, j : j + 29].long() for i in (0, 1) for j in (0, 1))
     area = (cells == 4).sum() + 0.5 * (cells == 3).sum()
-    assert trimesh.load(tmp_path / "p.ply", force="mesh").area == pytest.approx(float(area), rel=1e-5)
+    assert trimesh.load_mesh(tmp_path / "p.ply").area == pytest.approx(float(area), rel=1e-5)
 
 
 # --- whole or not at all -------------------------------------------------------------------------------------------

@@ -41,7 +41,7 @@ def dense(weight, r, pixel_size):
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (9, 1), (3, 3), (7, 5), (13, 22), (30, 17)])
 @pytest.mark.parametrize("pixel_size", [(1.0, 1.0), (0.5, 2.0)])
 def test_equals_a_dense_solve(size, pixel_size, generator):
-    mask, weight, r, b = problem(3, *size, 6, generator)
+    mask, weight, r, b = problem(3, *size, contrast=6, generator=generator)
     z = factor(weight, r, pixel_size).solve(b)
     for k in range(3):
         alive = mask[k].flatten()

@@ -24,7 +24,7 @@ def assert_solves(z, v, w, anchor=None, r=None, pixel_size=(1.0, 1.0), atol=1e-7
     """Each surface of z is the minimiser that SciPy finds."""
     for n in range(len(v)):
         one = [None if t is None else t[min(n, len(t) - 1)] for t in (w, anchor, r)]
-        expected = sparse_solve(v[n], *one, pixel_size)
+        expected = sparse_solve(v[n], *one, pixel_size=pixel_size)
         np.testing.assert_allclose(z[n, 0].detach().numpy(), expected, atol=atol * (1 + np.abs(expected).max()))
 
 

@@ -212,7 +212,9 @@ class NormalsToGradient(_Conversion):
         return field.gradient
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        def __call__(self, normals: Tensor) -> Tensor:
+            """As `forward`."""
 
 
 class GradientToNormals(_Conversion):
@@ -223,7 +225,9 @@ class GradientToNormals(_Conversion):
         return gradient_to_normals(gradient, self.convention, camera=self.camera, pixel_size=self.pixel_size)
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        def __call__(self, gradient: Tensor) -> Tensor:
+            """As `forward`."""
 
 
 def guess_convention(

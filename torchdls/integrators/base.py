@@ -74,7 +74,16 @@ class Integrator(nn.Module):
         return height if gradient.ndim == 4 else height[0]
 
     if TYPE_CHECKING:  # the call of `nn.Module` gives Any
-        __call__ = forward
+
+        def __call__(
+            self,
+            gradient: Tensor,
+            mask: Tensor | None = None,
+            weight: Tensor | None = None,
+            anchor: Tensor | None = None,
+            anchor_weight: Tensor | float | None = None,
+        ) -> Tensor:
+            """As `forward`."""
 
     def options(self) -> dict[str, Any]:
         """The arguments of the constructor as plain data, with which `torchdls.build` makes the integrator again.

@@ -106,7 +106,8 @@ def test_spectral_regularization_equals_dense_least_squares(shape, basis, modes)
     counts = [round(modes * n) for n in shape] if isinstance(modes, float) else modes
     build = {"cosine": cosine_basis, "polynomial": polynomial_basis}[basis]
     B_y, B_x = (build(n, k).numpy() for n, k in zip(shape, counts, strict=True))
-    expected = dense(g, *derivatives(shape), g[0, 1].numpy(), g[0, 0].numpy(), B_y, B_x)
+    D_y, D_x = derivatives(shape)
+    expected = dense(g, D_y, D_x, g[0, 1].numpy(), g[0, 0].numpy(), B_y, B_x)
     torch.testing.assert_close(z[0, 0], torch.from_numpy(expected), atol=1e-9, rtol=1e-9)
 
 

@@ -95,7 +95,7 @@ def test_a_sweep_keeps_no_residual() -> None:
     g = random_field(1, 2, 40, 40).requires_grad_()
     sizes: dict[bool, int] = {}
     for checkpoint in (False, True):
-        seen = {}
+        seen: dict[int, int] = {}
 
         def pack(t: Tensor, seen: dict[int, int] = seen) -> Tensor:
             seen[t.untyped_storage().data_ptr()] = t.untyped_storage().nbytes()

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from torchdls import (
 )
 from torchdls.surfaces import tent
 
-SMALL = {"patch_size": 4, "stride": 2, "n_atoms": 16, "n_iter": 6, "tol": 0.0}
+SMALL: dict[str, Any] = {"patch_size": 4, "stride": 2, "n_atoms": 16, "n_iter": 6, "tol": 0.0}
 H, W = 19, 17
 
 

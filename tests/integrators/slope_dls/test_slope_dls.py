@@ -1,5 +1,7 @@
 """SlopeDLS: what it promises on surfaces, and its parts against closed forms and simulated noise."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -11,7 +13,7 @@ from torchdls.noise import cosine_noise, height_noise, slope_covariance
 from torchdls.operators import GradientOperator, dct2
 from torchdls.selection import discrepancy_guard
 
-QUICK = {"tau": 1.2, "n_iter": 6}  # the recipe for fewer iterations
+QUICK: dict[str, Any] = {"tau": 1.2, "n_iter": 6}  # the recipe for fewer iterations
 
 
 def noisy(name="tent", n=64, snr=10, seed=0, dtype=torch.float64):

@@ -253,7 +253,17 @@ class TikhonovRegularization(GlobalLeastSquares):
         return height if gradient.ndim == 4 else height[0]
 
     if TYPE_CHECKING:
-        __call__ = forward
+
+        def __call__(
+            self,
+            gradient: Tensor,
+            mask: Tensor | None = None,
+            weight: Tensor | None = None,
+            anchor: Tensor | None = None,
+            anchor_weight: Tensor | float | None = None,
+            prior: Tensor | None = None,
+        ) -> Tensor:
+            """As `forward`."""
 
     def _prior(self, prior: Tensor, gradient: Tensor) -> Tensor:
         name = type(self).__name__

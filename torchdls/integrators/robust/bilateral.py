@@ -98,7 +98,3 @@ class Bilateral(Robust):
         assert isinstance(data, BilateralTerm)
         v, w = data.terms.quadratic(data.facing.expand_as(data.terms.live))
         return (self._surface(fields, v, w, fields.anchor_weight),)
-
-    def extra_repr(self) -> str:
-        """The settings, as `print` shows them."""
-        return f"k={self.k:g}, focal_length={self.focal_length:g}, {super().extra_repr()}"
