@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 import torchdls
 from tests.helpers import random_field
@@ -22,11 +23,13 @@ from torchdls import (
     Huber,
     Integrator,
     LeastSquares,
+    Patches,
     SlopeDLS,
     SoupDIL,
     TikhonovRegularization,
     WeightedLeastSquares,
 )
+from torchdls._options import plain
 
 pytest.importorskip("safetensors", reason="files of integrators need safetensors")
 
@@ -134,6 +137,15 @@ def test_every_learner_is_a_part(name: str) -> None:
     options = DLS(learner=LEARNERS[name]()).options()
     assert options["learner"]["name"] == name
     assert torchdls.build("dls", **options).options() == options
+
+
+def test_a_public_dataclass_is_a_part() -> None:
+    """As the objects are that an option may hold beside the registered ones."""
+    assert plain(Patches(4, 2)) == {"name": "Patches", "size": (4, 4), "stride": (2, 2)}
+    with pytest.raises(ValueError, match="size: 0 given"):
+        torchdls.build("dls", learner={"name": "Patches", "size": 0})
+    with pytest.raises(ValueError, match="learner: 'select' is unknown"):
+        torchdls.build("dls", learner={"name": "select"})
 
 
 def test_names_of_integrators_and_parts_differ() -> None:
@@ -330,6 +342,18 @@ def test_what_has_no_name_is_not_kept(tmp_path: Path) -> None:
         with pytest.raises(TypeError, match="has no form as plain data"):
             torchdls.save(path, model)
     assert not path.exists()
+
+
+def test_parametrised_modules_show_but_are_not_kept(tmp_path: Path) -> None:
+    """Their tensors are functions of others, which the constructor does not take."""
+    model = DLS(**SMALL, lam=nn.Parameter(torch.tensor(0.25)))
+    parametrize.register_parametrization(model, "lam", nn.Softplus())
+    assert repr(model) == "DLS(patch_size=(4, 4), n_atoms=16, lam=Tensor(0.825939), n_iter=2, tol=0.0)"
+    with pytest.raises(ValueError, match="ParametrizedDLS is not one of least_squares, "):
+        torchdls.save(tmp_path / "a.safetensors", model)
+    parametrize.remove_parametrizations(model, "lam")
+    torchdls.save(tmp_path / "a.safetensors", model)
+    assert torch.equal(torchdls.load(tmp_path / "a.safetensors").get_parameter("lam"), model.lam)
 
 
 def test_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,6 @@
 """Options as plain data: what a method was made with, in numbers, words, tuples and dicts, and as `repr` shows it.
 
-A part such as a learner or a data term becomes {"name": its name in the tables, option: value, ...}. A tensor becomes
+A part such as a learner or a data term becomes {"name": its name, option: value, ...}. A tensor becomes
 {"tensor": its shape, "dtype": ..., "kind": "buffer", "parameter" or "frozen parameter"}: a mark, since its values live
 in the `state_dict` of the module.
 """
@@ -8,6 +8,7 @@ in the `state_dict` of the module.
 from __future__ import annotations
 
 from dataclasses import fields, is_dataclass
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -35,8 +36,20 @@ def plain(value: Any) -> Any:
 
 
 def part_name(kind: type[Any]) -> str | None:
-    """The name of a class in the tables."""
-    return next((name for table in TABLES if (name := table.name_of(kind)) is not None), None)
+    """The name of a class in the tables; that of a public dataclass, such as an option object, is its own."""
+    named = next((name for table in TABLES if (name := table.name_of(kind)) is not None), None)
+    return named or (kind.__name__ if _public_dataclass(kind.__name__) is kind else None)
+
+
+def part_class(name: object) -> type[Any] | None:
+    """The class of that name; the inverse of `part_name`."""
+    found: type[Any] | None = next((table[str(name)] for table in TABLES if name in table), None)
+    return found or _public_dataclass(str(name))
+
+
+def _public_dataclass(name: str) -> type[Any] | None:
+    found = getattr(import_module("torchdls"), name, None)
+    return found if isinstance(found, type) and is_dataclass(found) else None
 
 
 def same(a: Any, b: Any) -> bool:

@@ -6,6 +6,7 @@ The tensors of the file are the `state_dict` of the integrator; its metadata hol
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 from collections.abc import Mapping
@@ -16,17 +17,16 @@ from torch import Tensor, nn
 
 import torchdls
 from torchdls._files import atomic_file, check_output, naming, require
-from torchdls._options import TABLES
-from torchdls._registry import INTEGRATORS, Registry
+from torchdls._options import TABLES, part_class
+from torchdls._registry import INTEGRATORS
 from torchdls.integrators import Integrator
 
 FORMAT, VERSION = "torchdls.integrator", 1
 _SUFFIX = ".safetensors"
-Tables = tuple[Registry[Any], ...]
 Tensors = dict[str, Tensor]
 
 
-def build(name: str, **options: Any) -> Integrator:
+def build(name: str, /, **options: Any) -> Integrator:
     """The integrator of that name with these options, as `Integrator.options` gives them.
 
     `build(name, **integrator.options())` makes an integrator again, as long as none of its options is a tensor: pass
@@ -44,7 +44,7 @@ def build(name: str, **options: Any) -> Integrator:
         >>> build("dls", learner={"name": "k_svd", "n_nonzero": 4}, n_iter=10)
         DLS(n_iter=10, learner=KSVD(n_nonzero=4, steps=1))
     """
-    return _make((INTEGRATORS,), {"name": name, **options}, None)
+    return _make_integrator(name, options, None)
 
 
 def save(path: str | os.PathLike[str], integrator: Integrator, *, overwrite: bool = False) -> None:
@@ -92,7 +92,7 @@ def load(path: str | os.PathLike[str]) -> Integrator:
         raise ValueError(f"{path}: has version {version!r} of the format, this torchdls reads up to {VERSION}")
     with naming(path, "an integrator"):
         description = json.loads(metadata["integrator"])
-        integrator = _make((INTEGRATORS,), {"name": description["name"], **description["options"]}, tensors)
+        integrator = _make_integrator(description["name"], description["options"], tensors)
         _check_tensors(integrator.state_dict(), tensors)
         integrator.load_state_dict(tensors, assign=True)
     return integrator
@@ -114,17 +114,30 @@ def _check_tensors(wanted: Mapping[str, Tensor], found: Mapping[str, Tensor]) ->
             raise ValueError(f"{key}: shape {tuple(found[key].shape)} given, {tuple(t.shape)} is needed")
 
 
-def _make(tables: tuple[Registry[Any], ...], part: dict[str, Any], tensors: Tensors | None, at: str = "") -> Any:
-    """The integrator or part of a dict {"name": ..., option: value}."""
-    options = dict(part)
-    name = options.pop("name")
-    table = next((table for table in tables if name in table), None)
-    if table is None:
-        raise ValueError(f"{name!r} is unknown; choose from {', '.join(n for table in tables for n in table)}")
-    known = table.parameters(name)
+def _make(made: type[Any], name: str, options: Mapping[str, Any], tensors: Tensors | None, at: str = "") -> Any:
+    """An integrator or part with options in their plain form, with its tensors where they are marks of some."""
+    known = inspect.signature(made).parameters
     if unknown := options.keys() - known.keys():
         raise ValueError(f"{name}: no option {', '.join(sorted(unknown))}; it has {', '.join(known)}")
-    return table[name](**{key: _value(value, tensors, f"{at}{key}") for key, value in options.items()})
+    return made(**{key: _value(value, tensors, f"{at}{key}") for key, value in options.items()})
+
+
+def _make_integrator(name: str, options: Mapping[str, Any], tensors: Tensors | None) -> Integrator:
+    if name not in INTEGRATORS:
+        raise ValueError(f"{name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
+    integrator: Integrator = _make(INTEGRATORS[name], name, options, tensors)
+    return integrator
+
+
+def _make_part(part: Mapping[str, Any], tensors: Tensors | None, at: str) -> Any:
+    """A part from {"name": ..., option: value}; `at` is its place in the state_dict."""
+    if "name" not in part:
+        raise ValueError(f"{at}: a dict without 'name' given, such as {{'name': 'k_svd', 'n_nonzero': 4}} is needed")
+    name, made = part["name"], part_class(part["name"])
+    if made is None:
+        known = ", ".join(name for table in TABLES for name in table)
+        raise ValueError(f"{at}: {name!r} is unknown; choose from {known}, or a public dataclass")
+    return _make(made, name, {key: value for key, value in part.items() if key != "name"}, tensors, f"{at}.")
 
 
 def _value(value: Any, tensors: Tensors | None, at: str) -> Any:
@@ -133,10 +146,8 @@ def _value(value: Any, tensors: Tensors | None, at: str) -> Any:
         return tuple(_value(v, tensors, at) for v in value)
     if not isinstance(value, dict):
         return value
-    if "tensor" not in value and "name" not in value:
-        raise ValueError(f"{at}: a dict without 'name' given, such as {{'name': 'k_svd', 'n_nonzero': 4}} is needed")
     if "tensor" not in value:
-        return _make(TABLES, value, tensors, f"{at}.")
+        return _make_part(value, tensors, at)
     if tensors is None:
         raise ValueError(f"{at}: this is the mark of a tensor, not its values; pass the tensor itself, or use `load`")
     if at not in tensors:

@@ -8,6 +8,7 @@ from math import sqrt
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 from torchdls._options import plain, same, shown
 from torchdls.integrators.data_term import edge_cost
@@ -99,15 +100,16 @@ class Integrator(nn.Module):
 
     def _arguments(self) -> dict[str, Any]:
         """The arguments of the constructor: each is kept as the attribute of its name."""
-        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
+        return {name: getattr(self, name) for name in inspect.signature(_class_of(self)).parameters}
 
     def __repr__(self) -> str:
         """The call that makes it: every option that differs from its default."""
-        arguments, parameters = self._arguments(), inspect.signature(type(self)).parameters
-        needed = {name: arguments[name] for name, p in parameters.items() if p.default is p.empty}
-        defaults = type(self)(**needed)._arguments()
+        kind, arguments = _class_of(self), self._arguments()
+        parameters = inspect.signature(kind).parameters.items()
+        needed = {name: arguments[name] for name, p in parameters if p.default is p.empty}
+        defaults = kind(**needed)._arguments()
         told = [n for n, value in arguments.items() if n in needed or not same(value, defaults[n])]
-        return f"{type(self).__name__}({', '.join(f'{name}={shown(arguments[name])}' for name in told)})"
+        return f"{kind.__name__}({', '.join(f'{name}={shown(arguments[name])}' for name in told)})"
 
     def integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels from checked fields; what a subclass provides."""
@@ -146,3 +148,9 @@ class Integrator(nn.Module):
             anchor_weight=None if fields.anchor_weight is None else fields.anchor_weight * h**2,
             steps=(self.pixel_size[0] / h, self.pixel_size[1] / h),
         )
+
+
+def _class_of(module: Integrator) -> type[Integrator]:
+    """The class of a module, whatever parametrisations it has been given since."""
+    kind: type[Integrator] = parametrize.type_before_parametrizations(module)
+    return kind
