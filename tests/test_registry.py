@@ -3,11 +3,14 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import torchdls
+from tests.helpers.methods import Method
 from torchdls import INTEGRATORS, Integrator
+from torchdls._registry import Registry
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -46,3 +49,12 @@ def test_names_are_listed_without_torch():
         "import sys; from torchdls.cli.main import _parser; _parser().format_help(); sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+def test_one_line_registers_a_class_of_any_module():
+    """Of the package by its public name, of elsewhere by its path: nothing else has to know it."""
+    table: Registry[Any] = Registry({"own": "tests.helpers.methods.Method", "huber": "Huber"})
+    assert table["own"] is Method
+    assert table.name_of(Method) == "own"
+    assert table.name_of(torchdls.Huber) == "huber"
+    assert table.name_of(torchdls.L1) is None

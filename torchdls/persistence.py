@@ -56,8 +56,8 @@ def save(path: str | os.PathLike[str], integrator: Integrator, *, overwrite: boo
         overwrite: replace a file.
 
     Raises:
-        ValueError: the suffix or the class is another, or a part is not in the tables.
-        TypeError: an option has no form as plain data.
+        ValueError: the suffix or the class is another; that of a parametrised module is, too.
+        TypeError: an option has no form as plain data, such as a learner of one's own.
         FileNotFoundError: the directory does not exist.
         FileExistsError: the file exists and `overwrite` is False.
         ImportError: safetensors is not installed.

@@ -1,5 +1,7 @@
 """Every packing of a normal map, with noise and backgrounds, against the normals of a sphere in closed form."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import tifffile
@@ -9,7 +11,13 @@ from torchdls import io
 from torchdls.geometry import normals_to_gradient
 from torchdls.io.packing import CHANNELS, describe, unpack
 
-DTYPES = {"u8": np.uint8, "u16": np.uint16, "float": np.float32, "0..255": np.float32, "0..65535": np.float32}
+DTYPES: dict[str, Any] = {
+    "u8": np.uint8,
+    "u16": np.uint16,
+    "float": np.float32,
+    "0..255": np.float32,
+    "0..65535": np.float32,
+}
 SCALE = {"0..255": 255, "0..65535": 65535}
 
 
