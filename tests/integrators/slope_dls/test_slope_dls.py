@@ -82,7 +82,7 @@ def test_zero_threshold_and_zero_iterations_are_least_squares(recipe):
 
 def test_result_and_callback():
     _, gradient = noisy(n=32)
-    seen = []
+    seen: list[Any] = []
     for recipe in ("blend", "quick", "plain"):
         seen.clear()
         method = SlopeDLS(n_iter=3, recipe=recipe)
