@@ -31,6 +31,7 @@ from .integrators import FrankotChellappa as FrankotChellappa
 from .integrators import HarkerOLeary as HarkerOLeary
 from .integrators import HornBrooks as HornBrooks
 from .integrators import Huber as Huber
+from .integrators import IntegrationResult as IntegrationResult
 from .integrators import Integrator as Integrator
 from .integrators import LeastSquares as LeastSquares
 from .integrators import LineIntegral as LineIntegral

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchdls import _files, io
+from torchdls import io
 from torchdls._files import atomic_file
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -73,7 +73,7 @@ def test_of_many_writers_exactly_one_wins(tmp_path, monkeypatch, links):
         raise PermissionError(1, "no hard links here")
 
     if not links:
-        monkeypatch.setattr(_files.os, "link", no_links)
+        monkeypatch.setattr(os, "link", no_links)
     ready, won, lost = threading.Barrier(8), [], []
 
     def rival(number):

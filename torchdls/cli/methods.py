@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import ast
-import inspect
 import sys
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -88,7 +87,7 @@ def build_method(name: str, pixel_size: tuple[float, float], settings: Sequence[
 def _bar(label: str, method: Integrator, quiet: bool) -> Iterator[Any]:
     """A callback that moves a progress bar, or None for methods without iterations to show."""
     steps = getattr(method, "n_iter", None)
-    if quiet or not steps or not hasattr(method, "solve") or not sys.stderr.isatty():
+    if quiet or not steps or not sys.stderr.isatty():
         yield None
         return
     from torchdls._files import require
@@ -110,9 +109,6 @@ def run_method(
     label: str, method: Integrator, quiet: bool, gradient: Tensor, **fields: Tensor | None
 ) -> tuple[Tensor, Tensor | None]:
     """The height, and the noise level if the method found one."""
-    solve: Any = getattr(method, "solve", None)
-    if solve is None or "callback" not in inspect.signature(solve).parameters:
-        return method(gradient, **fields), None
     with _bar(label, method, quiet) as step:
-        result = solve(gradient, **fields, callback=step)
-    return result.height, getattr(result, "noise", None)
+        result = method.solve(gradient, **fields, callback=step)
+    return result.height, result._asdict().get("noise")

@@ -1,7 +1,7 @@
 """From gradients to heights: every integrator is an outer loop around the solve (*)."""
 
 from torchdls._registry import INTEGRATORS
-from torchdls.integrators.base import Fields, Integrator
+from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic import (
     FrankotChellappa,
     HarkerOLeary,
@@ -42,6 +42,7 @@ __all__ = [
     "HarkerOLeary",
     "HornBrooks",
     "INTEGRATORS",
+    "IntegrationResult",
     "Integrator",
     "LeastSquares",
     "LineIntegral",

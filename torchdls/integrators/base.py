@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from math import sqrt
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
@@ -17,8 +19,24 @@ from torchdls.integrators.fields import Fields as Fields
 from torchdls.integrators.fields import check_accepted, check_values, fit_fields, within_mask
 from torchdls.operators import as_pixel_size, edge_slopes
 
+Callback = Callable[[int, Tensor], None]
 
-class Integrator(nn.Module):
+
+class IntegrationResult(NamedTuple):
+    """What `solve` returns at least; always batched.
+
+    Attributes:
+        height: (N, 1, H, W).
+        iterations: (N,) the iterations each surface took; 0 for direct methods.
+        converged: (N,) bool, whether it met the method's tolerance within them.
+    """
+
+    height: Tensor
+    iterations: Tensor
+    converged: Tensor
+
+
+class Integrator(nn.Module, ABC):
     """A method that turns gradients into heights.
 
     A new method is one short class with `integrate`. If it is an outer loop around the solve (*), it also says how
@@ -112,9 +130,47 @@ class Integrator(nn.Module):
         told = [n for n, value in arguments.items() if n in needed or not same(value, defaults[n])]
         return f"{kind.__name__}({', '.join(f'{name}={shown(arguments[name])}' for name in told)})"
 
+    @abstractmethod
     def integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels from checked fields; what a subclass provides."""
-        raise TypeError(f"{type(self).__name__}: an integrator must define integrate(fields)")
+
+    def solve(
+        self,
+        gradient: Tensor,
+        mask: Tensor | None = None,
+        weight: Tensor | None = None,
+        anchor: Tensor | None = None,
+        anchor_weight: Tensor | float | None = None,
+        *,
+        callback: Callback | None = None,
+    ) -> Any:
+        """Integrate as `forward` does, and tell how it went.
+
+        Args:
+            gradient: see `forward`, and so for the mask, weight and anchors; a single field is a batch of one.
+            mask: see `forward`.
+            weight: see `forward`.
+            anchor: see `forward`.
+            anchor_weight: see `forward`.
+            callback: called after each iteration as callback(iteration, cost (N,)), with iterations from 1, by methods
+                whose result holds the history of a cost.
+
+        Returns:
+            A named tuple, always batched, with at least `height`, `iterations` and `converged`, as `IntegrationResult`.
+
+        Raises:
+            TypeError: as `forward`.
+            ValueError: as `forward`.
+        """
+        fields = self.check(gradient, mask, weight, anchor, anchor_weight)
+        result = self.told(fields)
+        return result._replace(height=result.height * self.unit)
+
+    def told(self, fields: Fields) -> IntegrationResult:
+        """The height in pixels from checked fields, and how it went; a method that iterates says so."""
+        height = self.integrate(fields)
+        iterations = torch.zeros(len(height), dtype=torch.int64, device=height.device)
+        return IntegrationResult(height, iterations, iterations == 0)
 
     def edges(self, fields: Fields, z: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         """Slopes v and trusts w of the quadratic 1/2 sum w (A z - v)^2 that stands for the data term around z."""

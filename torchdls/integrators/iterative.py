@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
 from torch import Tensor
 
+from torchdls.integrators.base import Callback as Callback
 from torchdls.integrators.base import Fields, Integrator
-
-Callback = Callable[[int, Tensor], None]
 
 
 class HasHeight(Protocol):

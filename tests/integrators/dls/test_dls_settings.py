@@ -9,8 +9,8 @@ from tests.integrators.dls.test_dls import SMALL, H, W, field
 from torchdls import (
     DLS,
     SURFACES,
-    Integrator,
     LeastSquares,
+    LineIntegral,
     TotalVariation,
     add_noise,
     dct_dictionary,
@@ -108,7 +108,7 @@ def test_shared_dictionary_of_one_surface_is_its_own():
         ({"tol": -1e-3}, "tol=-0.001"),
         ({"z_tol": 0.0}, "z_tol=0.0"),
         ({"data_term": "tv"}, "data_term is a str"),
-        ({"data_term": Integrator()}, "data_term Integrator is not built on the weighted solve"),
+        ({"data_term": LineIntegral()}, "data_term LineIntegral is not built on the weighted solve"),
         ({"dictionary": [[1.0]]}, "dictionary is a list"),
         ({"dictionary": torch.ones(16, 4)}, r"dictionary \(16, 4\) given, .* n = 64"),
         ({"dictionary": torch.ones(64)}, r"dictionary \(64,\)"),

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchdls.integrators.base import Fields, Integrator
+from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.operators import GradientOperator, edge_slopes
 from torchdls.operators.edges import edge_ends
 from torchdls.solvers import ConvergenceWarning
@@ -57,6 +57,10 @@ class HornBrooks(Integrator):
 
     def integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
+        return self.told(fields).height
+
+    def told(self, fields: Fields) -> IntegrationResult:
+        """The relaxation, and how many sweeps each surface took."""
         a = GradientOperator("forward", fields.steps)
         g = fields.gradient
         mask = torch.ones_like(g[:, :1], dtype=torch.bool) if fields.mask is None else fields.mask
@@ -70,11 +74,13 @@ class HornBrooks(Integrator):
         colour = (i[:, None] + j) % 2 == 0
         goal = self.tol * b.detach().flatten(1).norm(dim=1)
         z, active = torch.zeros_like(b), torch.ones_like(goal, dtype=torch.bool)
+        sweeps = torch.zeros_like(goal, dtype=torch.int64)
         for _ in range(self.max_iter):
             residual = b - a.adjoint(w * a(z)) - r * z
             active = active & (residual.detach().flatten(1).norm(dim=1) > goal)
             if not bool(active.any()):
                 break
+            sweeps = sweeps + active
             turn = active.view(-1, 1, 1, 1)
             z = z + torch.where(turn & colour, step * residual, 0)
             residual = b - a.adjoint(w * a(z)) - r * z
@@ -82,4 +88,5 @@ class HornBrooks(Integrator):
         else:
             message = f"HornBrooks: {int(active.sum())} of {len(b)} surfaces above tol={self.tol:g}"
             warnings.warn(f"{message} after {self.max_iter} iterations", ConvergenceWarning, stacklevel=2)
-        return free_constants(w.detach(), r.expand_as(z).detach()).remove(z)
+        height = free_constants(w.detach(), r.expand_as(z).detach()).remove(z)
+        return IntegrationResult(height, sweeps, ~active)

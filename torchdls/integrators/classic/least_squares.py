@@ -7,7 +7,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from torchdls.integrators.base import Fields, Integrator
+from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic.dirichlet import solve_dirichlet
 from torchdls.solvers import SolveResult, direct_result, integrate_direct, solve
 
@@ -59,6 +59,11 @@ class LeastSquares(Integrator):
     def integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
         return self.solve_fields(fields).height
+
+    def told(self, fields: Fields) -> IntegrationResult:
+        """The height, and how the solve went."""
+        found = self.solve_fields(fields)
+        return IntegrationResult(found.height, found.iterations, found.converged)
 
     def solve_fields(self, fields: Fields, z0: Tensor | None = None) -> SolveResult:
         """The solve and how it went, from a warm start z0."""

@@ -123,22 +123,24 @@ class Run(NamedTuple):
 
 def run_in_legs(
     dls: Iteration, model: Model, state: State, cost: Tensor, n_iter: int, callback: Callback | None
-) -> tuple[State, Tensor, Tensor]:
+) -> tuple[State, Tensor, Tensor, Tensor]:
     """The iterations from `state`, whose objective is `cost` (N,).
 
     A run ends early where a surface settles; that surface then leaves the batch.
 
     Returns:
         The last state, without what iterations alone need; the objectives (N, n_iter + 1); which surfaces are still
-        on their way (N,).
+        on their way (N,); the iterations that each took (N,).
     """
     index = torch.arange(len(cost), device=cost.device)
     start, kept = state.start.detach(), Kept.of(state, None if model.valid is None else state.R)
     costs, active, parts = [cost], torch.ones_like(cost, dtype=torch.bool), []
+    taken = torch.zeros_like(index)
     del state
     while len(costs) <= n_iter and len(index):
         count = min(isqrt(n_iter - 1) + 1, n_iter + 1 - len(costs))
         kept, found, settled = advance(Run(dls, model, start, kept.places, kept.used, count, len(costs) == 1), kept)
+        taken = taken.index_add(0, index, torch.full_like(index, found.shape[1]))
         for value in found.unbind(1):
             costs.append(costs[-1].index_copy(0, index, value))
             if callback is not None:
@@ -150,7 +152,7 @@ def run_in_legs(
     if len(index):
         parts.append(Part(index, kept.end(model)))
     costs += [costs[-1]] * (n_iter + 1 - len(costs))
-    return merge(parts), torch.stack(costs, 1), active
+    return merge(parts), torch.stack(costs, 1), active, taken
 
 
 def advance(run: Run, kept: Kept) -> tuple[Kept, Tensor, Tensor]:

@@ -49,6 +49,7 @@ class DLSResult(NamedTuple):
         lam: (N,) the regularisation weight used.
         mu: (N,) the threshold used, for heights in pixels.
         converged: (N,) bool, whether the height settled to `tol` before the iterations ran out.
+        iterations: (N,) the iterations each surface took.
     """
 
     height: Tensor
@@ -59,6 +60,7 @@ class DLSResult(NamedTuple):
     lam: Tensor
     mu: Tensor
     converged: Tensor
+    iterations: Tensor
 
 
 class DLS(Iterative[DLSResult]):
@@ -228,23 +230,26 @@ class DLS(Iterative[DLSResult]):
         if self.checkpoint and self.n_iter and in_plain_autograd(state.z, state.D, model.lam, model.mu):
             options = self.learner, self.learn != "fixed", self.n_sweeps, self.bound, self.threshold, self.tol
             parts_of_one = Iteration(self._round, self._settled, self._step, *options)
-            end, values, active = run_in_legs(parts_of_one, model, state, objective[0], self.n_iter, callback)
-            return DLSResult(end.z, end.D, end.B, values, model.noise, model.lam, model.mu, ~active)
+            end, values, active, taken = run_in_legs(parts_of_one, model, state, objective[0], self.n_iter, callback)
+            return DLSResult(end.z, end.D, end.B, values, model.noise, model.lam, model.mu, ~active, taken)
         active = torch.ones_like(model.noise, dtype=torch.bool)
+        taken = torch.zeros_like(active, dtype=torch.int64)
         running, parts = model, [Part(torch.arange(len(active), device=active.device), state)]
         look = self.tol > 0 and is_concrete(model.fields.gradient)
         for iteration in range(1, self.n_iter + 1):
             index, old = parts[-1]
             new, value = self._round(running, old, first=iteration == 1)
             settled = self._settled(new, old)
+            whole = len(index) == len(active)
+            taken = taken + active if whole else taken.index_add(0, index, torch.ones_like(index))
             if not look:  # every surface stays in the batch, and those that have settled do not move
                 new = old.choose(active, new) if self.tol > 0 else new
                 value = torch.where(active, value, objective[-1]) if self.tol > 0 else value
             parts[-1] = Part(index, new)
-            objective.append(value if len(index) == len(active) else objective[-1].index_copy(0, index, value))
+            objective.append(value if whole else objective[-1].index_copy(0, index, value))
             if callback is not None:
                 callback(iteration, objective[-1].detach())
-            active = active & ~settled if len(index) == len(active) else active.index_copy(0, index, ~settled)
+            active = active & ~settled if whole else active.index_copy(0, index, ~settled)
             if look and bool(settled.any()):  # what has settled leaves the batch
                 if bool(settled.all()):
                     break
@@ -252,7 +257,9 @@ class DLS(Iterative[DLSResult]):
                 running = running.part(~settled)
         objective += [objective[-1]] * (self.n_iter + 1 - len(objective))
         end = merge(parts)
-        return DLSResult(end.z, end.D, end.B, torch.stack(objective, 1), model.noise, model.lam, model.mu, ~active)
+        return DLSResult(
+            end.z, end.D, end.B, torch.stack(objective, 1), model.noise, model.lam, model.mu, ~active, taken
+        )
 
     def _start(self, model: Model) -> State:
         """Heights of the data term alone, and no codes: the patches are the residual."""

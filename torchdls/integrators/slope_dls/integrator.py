@@ -50,6 +50,16 @@ class SlopeDLSResult(NamedTuple):
     noise: Tensor
     confidence: Tensor
 
+    @property
+    def iterations(self) -> Tensor:
+        """(N,) the iterations of the (first) run: as many as asked for."""
+        return torch.full_like(self.noise, self.misfit.shape[1] - 1, dtype=torch.int64)
+
+    @property
+    def converged(self) -> Tensor:
+        """(N,) bool: the iterations are a fixed number, and all were made."""
+        return torch.ones_like(self.noise, dtype=torch.bool)
+
 
 @dataclass(frozen=True)
 class _Plain:
