@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import torch
 from torch import Tensor, nn
 
 from torchdls.dictionary.learners import LEARNERS, Learner, SoupDIL
 from torchdls.dictionary.soup_dil import Order, Unused
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold
+from torchdls.operators import Patches
 
 Learn = Literal["each", "shared", "fixed"]
 Grad = Literal["auto", "unroll", "implicit", "frozen_dictionary", "none"]
@@ -37,7 +39,7 @@ def check_options(*, bound: float, tol: float, z_tol: float, grad_tol: float, **
         raise ValueError(f"DLS: {positive}, tol={tol!r} not negative")
 
 
-def derivative(grad: Grad, learn: Learn, threshold: str, steady: bool, dictionary: Tensor) -> Grad:
+def resolve_derivative(grad: Grad, learn: Learn, threshold: str, steady: bool, dictionary: Tensor) -> Grad:
     """The kind of derivative that "auto" stands for, once the kind asked for is found to exist.
 
     Args:
@@ -77,9 +79,53 @@ def choose_learner(learner: str | Learner | None, order: Order, unused: Unused, 
     return learner
 
 
-def keep(module: nn.Module, name: str, value: float | Tensor | str) -> None:
+def register_setting(module: nn.Module, name: str, value: float | Tensor | str) -> None:
     """A tensor becomes a buffer, so that it moves with the module, unless it is a parameter already."""
     if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):
         module.register_buffer(name, value.detach().clone())
     else:
         setattr(module, name, value)
+
+
+def check_strength(name: str, value: float | Tensor | str) -> float | Tensor | str:
+    """Lam or mu: "auto", a number or a tensor, neither negative nor NaN; mu may be infinite, lam may not."""
+    if not isinstance(value, str | int | float | Tensor):
+        raise TypeError(f"DLS: {name} is a {type(value).__name__}, 'auto', a number or a tensor is needed")
+    if isinstance(value, str):
+        known = value == "auto"
+    else:
+        values = value.detach() if isinstance(value, Tensor) else torch.tensor(value, device="cpu")
+        known = bool((values >= 0).all()) and (name == "mu" or bool(values.isfinite().all()))
+    if not known:
+        raise ValueError(f"DLS: {name}={value!r} given, 'auto' or a number of at least 0 is needed")
+    return value
+
+
+def per_surface(name: str, value: float | Tensor | str, auto: Tensor) -> Tensor:
+    """Lam or mu as (N,): what was given, or what was found for "auto"."""
+    if isinstance(value, str):
+        return auto
+    value = torch.as_tensor(value, dtype=auto.dtype, device=auto.device)
+    if value.numel() not in (1, auto.numel()):
+        raise ValueError(f"DLS: {name} {tuple(value.shape)} does not fit {auto.numel()} surfaces")
+    return value.reshape(-1).expand(auto.shape)
+
+
+def check_size(gradient: Tensor, patches: Patches) -> None:
+    """ValueError if the field is smaller than a patch."""
+    try:
+        patches.grid(gradient.shape)
+    except ValueError as error:
+        raise ValueError(f"DLS: gradient {tuple(gradient.shape)}: {error}") from error
+
+
+def check_dictionary(dictionary: Tensor, patches: Patches) -> None:
+    """The initial dictionary must fit the patches and have no atom that is zero."""
+    if not isinstance(dictionary, Tensor):
+        raise TypeError(f"DLS: dictionary is a {type(dictionary).__name__}, a tensor is needed")
+    if dictionary.ndim not in (2, 3) or dictionary.shape[-2] != patches.n_pixels or 0 in dictionary.shape:
+        wanted = f"(n, K) or (N, n, K) with n = {patches.n_pixels}"
+        raise ValueError(f"DLS: dictionary {tuple(dictionary.shape)} given, {wanted} is needed")
+    norms = dictionary.detach().norm(dim=-2)
+    if not bool((norms.isfinite() & (norms > 0)).all()):
+        raise ValueError("DLS: dictionary has an atom that is zero or not finite")
