@@ -25,6 +25,7 @@ from torchdls.integrators.dls.problem import Finished, Problem, State, drop_cost
 from torchdls.integrators.dls.settings import (
     Grad,
     Learn,
+    check_combination,
     check_dictionary,
     check_options,
     check_size,
@@ -129,7 +130,8 @@ class DLS(Iterative[DLSResult]):
         pixel_size: (dx, dy) or one number; heights come out in its unit.
 
     Raises:
-        ValueError: an option is unknown or out of range, or the dictionary does not fit the patches.
+        ValueError: an option is unknown, out of range or without effect beside another, or the dictionary does not fit
+            the patches.
         TypeError: `data_term` is not an integrator.
 
     Source: Wagenmaker, Moore, Nadakuditi, "Robust surface reconstruction from gradients via adaptive dictionary
@@ -175,7 +177,8 @@ class DLS(Iterative[DLSResult]):
             raise TypeError(f"DLS: data_term is a {type(data_term).__name__}, an Integrator is needed")
         if not self.data_term.quadratic:
             raise ValueError(f"DLS: data_term {type(data_term).__name__} is not built on the weighted solve")
-        learn = "fixed" if learner == "fixed" or isinstance(learner, FixedDictionary) else learn
+        asked, fixed = learn, learner == "fixed" or isinstance(learner, FixedDictionary)
+        learn = "fixed" if fixed else learn
         options = {"z_step": z_step, "order": order, "learn": learn, "unused": unused, "threshold": threshold}
         counts = {"n_iter": n_iter, "n_sweeps": n_sweeps, "n_prox": n_prox}
         check_options(**options, **counts, grad=grad, bound=bound, tol=tol, z_tol=z_tol, grad_tol=grad_tol)
@@ -184,7 +187,7 @@ class DLS(Iterative[DLSResult]):
         self.n_iter, self.n_sweeps, self.n_prox = n_iter, n_sweeps, n_prox
         self.z_step, self.order, self.learn, self.unused, self.threshold = z_step, order, learn, unused, threshold
         self.bound, self.tol, self.z_tol, self.grad_tol = bound, tol, z_tol, grad_tol
-        self.learner = choose_learner(learner, order, unused, threshold)
+        self.learner = choose_learner(learner, order, unused, threshold, self.patches)
         self.checkpoint, self.select = checkpoint, select
         if select:
             check_selectable(self.data_term, learn)
@@ -192,6 +195,7 @@ class DLS(Iterative[DLSResult]):
         check_dictionary(initial, self.patches)
         register_setting(self, "dictionary", initial)
         self.grad = resolve_derivative(grad, learn, threshold, self._steady, initial)
+        check_combination(learn=asked, fixed=fixed, n_prox=n_prox, z_step=z_step, checkpoint=checkpoint, grad=self.grad)
 
     def in_units(self, result: DLSResult) -> DLSResult:
         """Height and codes in the unit of `pixel_size`."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from torchdls.dictionary.learners import LEARNERS, Learner, SoupDIL
+from torchdls.dictionary.learners import LEARNERS, DinoKat, Learner, SoupDIL
 from torchdls.dictionary.soup_dil import Order, Unused
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold
 from torchdls.operators import Patches
@@ -64,8 +65,10 @@ def resolve_derivative(grad: Grad, learn: Learn, threshold: str, steady: bool, d
     return grad
 
 
-def choose_learner(learner: str | Learner | None, order: Order, unused: Unused, threshold: Threshold) -> Learner:
-    """The learner of that name, or the one given; None is SOUP-DIL with the other options."""
+def choose_learner(
+    learner: str | Learner | None, order: Order, unused: Unused, threshold: Threshold, patches: Patches
+) -> Learner:
+    """The learner of that name for these patches, or the one given; None is SOUP-DIL with the other options."""
     if learner is None or learner == "soup_dil":
         return SoupDIL(order, unused, threshold)
     if isinstance(learner, str):
@@ -76,7 +79,22 @@ def choose_learner(learner: str | Learner | None, order: Order, unused: Unused, 
         raise TypeError(f"DLS: learner is a {type(learner).__name__}, a name or a Learner is needed")
     if getattr(learner, "threshold", "hard") != threshold:
         raise ValueError(f"DLS: threshold={threshold!r} does not go with learner={learner!r}")
+    for name, value, default in (("order", order, "atom"), ("unused", unused, "first")):
+        if value not in (default, getattr(learner, name, default)):
+            raise ValueError(f"DLS: {name}={value!r} does not go with learner={learner!r}")
+    if isinstance(learner, DinoKat) and learner.patch_size is None and isinstance(patches.size, tuple):
+        learner = replace(learner, patch_size=patches.size)
     return learner
+
+
+def check_combination(*, learn: Learn, fixed: bool, n_prox: int, z_step: str, checkpoint: bool, grad: Grad) -> None:
+    """ValueError for an option that another one would leave without effect."""
+    if fixed and learn == "shared":
+        raise ValueError("DLS: learn='shared' does not go with a fixed dictionary")
+    if n_prox != 1 and z_step == "exact":
+        raise ValueError(f"DLS: n_prox={n_prox} does not go with z_step='exact'; take z_step='proximal'")
+    if checkpoint and grad != "unroll":
+        raise ValueError(f"DLS: checkpoint=True does not go with grad={grad!r}; take grad='unroll'")
 
 
 def register_setting(module: nn.Module, name: str, value: float | Tensor | str) -> None:
