@@ -9,6 +9,7 @@ from tests.integrators.dls.test_dls import SMALL, H, W, field
 from torchdls import (
     DLS,
     SURFACES,
+    DinoKat,
     LeastSquares,
     LineIntegral,
     TotalVariation,
@@ -76,6 +77,14 @@ def test_one_dictionary_for_each_surface():
         torch.testing.assert_close(both[i : i + 1], DLS(**SMALL, mu=0.5, dictionary=atoms[i])(g[i : i + 1]))
 
 
+def test_low_rank_atoms_have_the_shape_of_the_patch():
+    dls = DLS(patch_size=(4, 8), n_atoms=32, learner="dino_kat", n_iter=2, mu=0.5)
+    result = dls.solve(field(1))
+    kept = DLS(patch_size=(4, 8), n_atoms=32, learner=DinoKat(), n_iter=2, mu=0.5)(field(1))
+    assert (torch.linalg.matrix_rank(result.dictionary[0].mT.unflatten(1, (4, 8)), rtol=1e-6) == 1).all()
+    torch.testing.assert_close(kept, result.height, rtol=0, atol=0)
+
+
 def test_shared_dictionary_of_one_surface_is_its_own():
     g = field(1)
     torch.testing.assert_close(DLS(**SMALL, learn="shared")(g), DLS(**SMALL, learn="each")(g), rtol=0, atol=1e-10)
@@ -115,6 +124,11 @@ def test_shared_dictionary_of_one_surface_is_its_own():
         ({"dictionary": torch.zeros(64, 4)}, "atom that is zero or not finite"),
         ({"dictionary": torch.full((64, 4), torch.nan)}, "atom that is zero or not finite"),
         ({"pixel_size": 0}, "pixel_size: 0 given"),
+        ({"learner": "k_svd", "order": "block"}, "order='block' does not go with learner=KSVD"),
+        ({"learner": "fixed", "unused": "keep"}, "unused='keep' does not go with learner=FixedDictionary"),
+        ({"learner": "fixed", "learn": "shared"}, "learn='shared' does not go with a fixed dictionary"),
+        ({"n_prox": 3}, "n_prox=3 does not go with z_step='exact'"),
+        ({"learn": "fixed", "checkpoint": True}, "checkpoint=True does not go with grad='implicit'"),
     ],
     ids=str,
 )

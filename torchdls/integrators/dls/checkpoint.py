@@ -20,7 +20,7 @@ from torch import Tensor
 from torchdls.dictionary.learners import FixedDictionary, Learner, SoupDIL
 from torchdls.dictionary.sweep_adjoint import Codes, Sweep
 from torchdls.dictionary.thresholds import Threshold
-from torchdls.integrators.dls.problem import Model, Part, State, merge, pays_off, support
+from torchdls.integrators.dls.problem import Finished, Problem, State, codes_pay, merge, support
 from torchdls.integrators.iterative import Callback
 
 
@@ -31,9 +31,9 @@ class Iteration(NamedTuple):
     `step` the height from the one before and the folded residual of the patches.
     """
 
-    round: Callable[[Model, State, bool], tuple[State, Tensor]]
+    round: Callable[[Problem, State, bool], tuple[State, Tensor]]
     settled: Callable[[State, State], Tensor]
-    step: Callable[[Model, Tensor, Tensor], Tensor]
+    step: Callable[[Problem, Tensor, Tensor], Tensor]
     learner: Learner
     learn: bool
     n_sweeps: int
@@ -68,14 +68,14 @@ class Kept(NamedTuple):
         """How many codes of each surface are not zero."""
         return self.used.sum(1).tolist()
 
-    def codes(self, model: Model) -> Tensor:
+    def codes(self, model: Problem) -> Tensor:
         """(N, K, L) all of them."""
         rows, columns = model.patches.grid(self.z.shape)
         shape = (len(self.z), self.D.shape[-1], rows * columns)
         flat = self.values.new_zeros(len(self.z), shape[1] * shape[2])
         return flat.scatter_add(1, self.places.long(), self.values).view(shape)
 
-    def state(self, model: Model, start: Tensor) -> State:
+    def state(self, model: Problem, start: Tensor) -> State:
         """All of it again."""
         B = self.codes(model)
         if self.R is not None:
@@ -84,12 +84,12 @@ class Kept(NamedTuple):
         R = P.baddbmm(*minus, alpha=-1) if torch.is_grad_enabled() else P.baddbmm_(*minus, alpha=-1)
         return State(start, self.z, _inside(R.mT, model), self.D, B)
 
-    def part(self, keep: Tensor) -> Kept:
+    def select(self, keep: Tensor) -> Kept:
         """The surfaces that `keep` holds."""
         parts = (t[keep] if t is not None and len(t) == len(keep) else t for t in self)
         return Kept(*parts)  # type: ignore[arg-type]
 
-    def end(self, model: Model) -> State:
+    def end(self, model: Problem) -> State:
         """Height, dictionary and codes of surfaces that have stopped; what the iterations need besides is left out."""
         return State(self.z, self.z, self.z, self.D, self.codes(model))
 
@@ -98,7 +98,7 @@ class Run(NamedTuple):
     """Some iterations: how they are made, from where, how many at most, and whether the first of all is among them."""
 
     dls: Iteration
-    model: Model
+    model: Problem
     start: Tensor
     places: Tensor
     used: Tensor
@@ -122,7 +122,7 @@ class Run(NamedTuple):
 
 
 def run_in_legs(
-    dls: Iteration, model: Model, state: State, cost: Tensor, n_iter: int, callback: Callback | None
+    dls: Iteration, model: Problem, state: State, cost: Tensor, n_iter: int, callback: Callback | None
 ) -> tuple[State, Tensor, Tensor, Tensor]:
     """The iterations from `state`, whose objective is `cost` (N,).
 
@@ -147,10 +147,10 @@ def run_in_legs(
                 callback(len(costs) - 1, costs[-1].detach())
         active = active.index_copy(0, index, ~settled)
         if dls.tol > 0 and bool(settled.any()):
-            parts.append(Part(index[settled], kept.part(settled).end(model.part(settled))))
-            index, start, kept, model = index[~settled], start[~settled], kept.part(~settled), model.part(~settled)
+            parts.append(Finished(index[settled], kept.select(settled).end(model.select(settled))))
+            index, start, kept, model = index[~settled], start[~settled], kept.select(~settled), model.select(~settled)
     if len(index):
-        parts.append(Part(index, kept.end(model)))
+        parts.append(Finished(index, kept.end(model)))
     costs += [costs[-1]] * (n_iter + 1 - len(costs))
     return merge(parts), torch.stack(costs, 1), active, taken
 
@@ -241,7 +241,7 @@ class _Back(NamedTuple):
         bare = _inside(state.R, model).clone() if self.first and model.valid is not None else None
         R, D, B = dls.learner(state.R, state.D, state.B, model.mu[:, None], dls.bound, dls.learn)
         codes_after = [Codes.of(b) for b in _rows(B, self._alone(D))]
-        pays = None if bare is None else pays_off(bare, _inside(R, model), B, model.mu, dls.threshold)
+        pays = None if bare is None else codes_pay(bare, _inside(R, model), B, model.mu, dls.threshold)
         final = _inside(R, model) if pays is None else torch.where(pays, _inside(R, model), bare)  # type: ignore[arg-type]
         del state, B, bare
         slope_z, folded, leaves = self._through_step(patches.adjoint(final, gz.shape), gz)
@@ -339,7 +339,7 @@ def _rows(B: Tensor, alone: bool) -> Tensor:
     return B if alone else B.transpose(0, 1).flatten(1)[None]
 
 
-def _inside(R: Tensor, model: Model) -> Tensor:
+def _inside(R: Tensor, model: Problem) -> Tensor:
     return R if model.valid is None else torch.where(model.valid, R, 0)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchdls._tracing import is_concrete
 from torchdls.integrators.base import Integrator
 from torchdls.integrators.classic.least_squares import LeastSquares
-from torchdls.integrators.dls.problem import Model
+from torchdls.integrators.dls.problem import Problem
 from torchdls.integrators.fields import even
 from torchdls.selection import select
 
@@ -27,7 +27,7 @@ def check_selectable(data_term: Integrator, learn: str) -> None:
         raise ValueError("DLS: select=True chooses per surface and does not go with learn='shared'")
 
 
-def choose_threshold(model: Model, automatic: bool, run: Callable[[Tensor, Tensor], Tensor]) -> Model:
+def choose_threshold(model: Problem, automatic: bool, run: Callable[[Tensor, Tensor], Tensor]) -> Problem:
     """The model with the threshold of least predicted risk; lam = 0, which is least squares, where none is chosen.
 
     Args:

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchdls._tracing import in_plain_autograd, is_recorded
 from torchdls.dictionary.thresholds import Threshold
-from torchdls.integrators.dls.problem import Model
+from torchdls.integrators.dls.problem import Problem
 from torchdls.operators import GradientOperator, Patches
 from torchdls.operators.edges import present_edges
 from torchdls.solvers import ConvergenceWarning, conjugate_gradients
@@ -48,8 +48,8 @@ class _Setting(NamedTuple):
     codes: bool = True
 
 
-def at_fixed_point(
-    model: Model,
+def implicit_derivative(
+    model: Problem,
     z: Tensor,
     D: Tensor,
     B: Tensor,

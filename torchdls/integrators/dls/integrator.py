@@ -20,11 +20,22 @@ from torchdls.integrators.classic.least_squares import LeastSquares
 from torchdls.integrators.data_term import edge_cost
 from torchdls.integrators.dls.checkpoint import Iteration, run_in_legs
 from torchdls.integrators.dls.choice import check_selectable, choose_threshold
-from torchdls.integrators.dls.implicit import at_fixed_point
-from torchdls.integrators.dls.problem import Model, Part, State, merge, patch_cost, worthwhile
-from torchdls.integrators.dls.settings import Grad, Learn, check_options, choose_learner, derivative, keep
+from torchdls.integrators.dls.implicit import implicit_derivative
+from torchdls.integrators.dls.problem import Finished, Problem, State, drop_costly_codes, merge, patch_cost
+from torchdls.integrators.dls.settings import (
+    Grad,
+    Learn,
+    check_combination,
+    check_dictionary,
+    check_options,
+    check_size,
+    check_strength,
+    choose_learner,
+    per_surface,
+    register_setting,
+    resolve_derivative,
+)
 from torchdls.integrators.dls.window import live_window
-from torchdls.integrators.dls_checks import check_dictionary, check_size, parameter, per_surface
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.noise import noise_level
 from torchdls.operators import GradientOperator, Patches
@@ -121,7 +132,8 @@ class DLS(Iterative[DLSResult]):
         pixel_size: (dx, dy) or one number; heights come out in its unit.
 
     Raises:
-        ValueError: an option is unknown or out of range, or the dictionary does not fit the patches.
+        ValueError: an option is unknown, out of range or without effect beside another, or the dictionary does not fit
+            the patches.
         TypeError: `data_term` is not an integrator.
 
     Source: Wagenmaker, Moore, Nadakuditi, "Robust surface reconstruction from gradients via adaptive dictionary
@@ -167,23 +179,25 @@ class DLS(Iterative[DLSResult]):
             raise TypeError(f"DLS: data_term is a {type(data_term).__name__}, an Integrator is needed")
         if not self.data_term.quadratic:
             raise ValueError(f"DLS: data_term {type(data_term).__name__} is not built on the weighted solve")
-        learn = "fixed" if learner == "fixed" or isinstance(learner, FixedDictionary) else learn
+        asked, fixed = learn, learner == "fixed" or isinstance(learner, FixedDictionary)
+        learn = "fixed" if fixed else learn
         options = {"z_step": z_step, "order": order, "learn": learn, "unused": unused, "threshold": threshold}
         counts = {"n_iter": n_iter, "n_sweeps": n_sweeps, "n_prox": n_prox}
         check_options(**options, **counts, grad=grad, bound=bound, tol=tol, z_tol=z_tol, grad_tol=grad_tol)
-        keep(self, "lam", parameter("lam", lam))
-        keep(self, "mu", parameter("mu", mu))
+        register_setting(self, "lam", check_strength("lam", lam))
+        register_setting(self, "mu", check_strength("mu", mu))
         self.n_iter, self.n_sweeps, self.n_prox = n_iter, n_sweeps, n_prox
         self.z_step, self.order, self.learn, self.unused, self.threshold = z_step, order, learn, unused, threshold
         self.bound, self.tol, self.z_tol, self.grad_tol = bound, tol, z_tol, grad_tol
-        self.learner = choose_learner(learner, order, unused, threshold)
+        self.learner = choose_learner(learner, order, unused, threshold, self.patches)
         self.checkpoint, self.select = checkpoint, select
         if select:
             check_selectable(self.data_term, learn)
         initial = dct_dictionary(self.patches.size, n_atoms) if dictionary is None else dictionary
         check_dictionary(initial, self.patches)
-        keep(self, "dictionary", initial)
-        self.grad = derivative(grad, learn, threshold, self._steady, initial)
+        register_setting(self, "dictionary", initial)
+        self.grad = resolve_derivative(grad, learn, threshold, self._steady, initial)
+        check_combination(learn=asked, fixed=fixed, n_prox=n_prox, z_step=z_step, checkpoint=checkpoint, grad=self.grad)
 
     def in_units(self, result: DLSResult) -> DLSResult:
         """Height and codes in the unit of `pixel_size`."""
@@ -204,7 +218,7 @@ class DLS(Iterative[DLSResult]):
             return result._replace(height=height)
         return result._replace(height=window.put_back(height), codes=window.put_codes_back(result.codes))
 
-    def _differentiated(self, model: Model, callback: Callback | None) -> DLSResult:
+    def _differentiated(self, model: Problem, callback: Callback | None) -> DLSResult:
         """The result of the iterations, with the derivative that was chosen."""
         if self.grad == "unroll":
             return self._run_within(model, callback)
@@ -214,17 +228,17 @@ class DLS(Iterative[DLSResult]):
         if self.grad == "none":
             return found
         D = self._initial_dictionary(model.fields) if self.learn == "fixed" else found.dictionary
-        height, codes = at_fixed_point(
+        height, codes = implicit_derivative(
             model, found.height, D, found.codes, threshold=self.threshold, bound=self.bound, tol=self.grad_tol
         )
         return found._replace(height=height, dictionary=D, codes=codes, noise=model.noise, lam=model.lam, mu=model.mu)
 
-    def _trial(self, model: Model, gradient: Tensor, mu: Tensor) -> Tensor:
+    def _trial(self, model: Problem, gradient: Tensor, mu: Tensor) -> Tensor:
         """Height of other gradients with another threshold."""
         other = self._model(model.fields._replace(gradient=gradient), model.noise)
         return self._run_within(other._replace(lam=model.lam, mu=mu), None).height
 
-    def _run_within(self, model: Model, callback: Callback | None) -> DLSResult:
+    def _run_within(self, model: Problem, callback: Callback | None) -> DLSResult:
         state = self._start(model)
         objective = [self._objective(model, state)]
         if self.checkpoint and self.n_iter and in_plain_autograd(state.z, state.D, model.lam, model.mu):
@@ -234,7 +248,7 @@ class DLS(Iterative[DLSResult]):
             return DLSResult(end.z, end.D, end.B, values, model.noise, model.lam, model.mu, ~active, taken)
         active = torch.ones_like(model.noise, dtype=torch.bool)
         taken = torch.zeros_like(active, dtype=torch.int64)
-        running, parts = model, [Part(torch.arange(len(active), device=active.device), state)]
+        running, parts = model, [Finished(torch.arange(len(active), device=active.device), state)]
         look = self.tol > 0 and is_concrete(model.fields.gradient)
         for iteration in range(1, self.n_iter + 1):
             index, old = parts[-1]
@@ -245,7 +259,7 @@ class DLS(Iterative[DLSResult]):
             if not look:  # every surface stays in the batch, and those that have settled do not move
                 new = old.choose(active, new) if self.tol > 0 else new
                 value = torch.where(active, value, objective[-1]) if self.tol > 0 else value
-            parts[-1] = Part(index, new)
+            parts[-1] = Finished(index, new)
             objective.append(value if whole else objective[-1].index_copy(0, index, value))
             if callback is not None:
                 callback(iteration, objective[-1].detach())
@@ -253,15 +267,15 @@ class DLS(Iterative[DLSResult]):
             if look and bool(settled.any()):  # what has settled leaves the batch
                 if bool(settled.all()):
                     break
-                parts[-1:] = [Part(index[keep], new.part(keep)) for keep in (settled, ~settled)]
-                running = running.part(~settled)
+                parts[-1:] = [Finished(index[keep], new.select(keep)) for keep in (settled, ~settled)]
+                running = running.select(~settled)
         objective += [objective[-1]] * (self.n_iter + 1 - len(objective))
         end = merge(parts)
         return DLSResult(
             end.z, end.D, end.B, torch.stack(objective, 1), model.noise, model.lam, model.mu, ~active, taken
         )
 
-    def _start(self, model: Model) -> State:
+    def _start(self, model: Problem) -> State:
         """Heights of the data term alone, and no codes: the patches are the residual."""
         z = self.data_term.integrate(model.fields)
         D = self._initial_dictionary(model.fields)
@@ -272,7 +286,7 @@ class DLS(Iterative[DLSResult]):
             R = torch.where(some, model.patches.extract(self._extend(model, z)), 0)
         return State(z, z, R, D, R.new_zeros(R.shape[0], D.shape[-1], R.shape[-1]))
 
-    def _extend(self, model: Model, z: Tensor) -> Tensor:
+    def _extend(self, model: Problem, z: Tensor) -> Tensor:
         """The height continued over the patches that hold a valid pixel."""
         assert model.fields.mask is not None
         assert model.valid is not None
@@ -280,12 +294,12 @@ class DLS(Iterative[DLSResult]):
         reach = model.patches.adjoint(live, z.shape) > 0
         return harmonic_extension(z, model.fields.mask, reach, tol=self.z_tol, pixel_size=model.fields.steps)
 
-    def _round(self, model: Model, state: State, first: bool) -> tuple[State, Tensor]:
+    def _round(self, model: Problem, state: State, first: bool) -> tuple[State, Tensor]:
         """One iteration, and the objective after it."""
         state = self._iterate(model, state, first)
         return state, self._objective(model, state)
 
-    def _iterate(self, model: Model, state: State, first: bool) -> State:
+    def _iterate(self, model: Problem, state: State, first: bool) -> State:
         """Codes and atoms, then the height."""
         R, D, B = state.R, state.D, state.B
         bare = torch.where(model.valid, R, 0) if first and model.valid is not None else None
@@ -294,7 +308,7 @@ class DLS(Iterative[DLSResult]):
             # Filling the invalid pixels of a patch by its approximation D b means: no residual there.
             R = R if model.valid is None else torch.where(model.valid, R, 0)
             if bare is not None:
-                R, B = worthwhile(bare, R, B, model.mu, self.threshold)
+                R, B = drop_costly_codes(bare, R, B, model.mu, self.threshold)
                 bare = None
         z = self._step(model, state.z, model.patches.adjoint(R, state.z.shape))
         return State(state.start, z, model.patches.extract_onto(R, z - state.z), D, B)
@@ -305,7 +319,7 @@ class DLS(Iterative[DLSResult]):
         settled = step <= self.tol * way
         return settled.all().expand_as(settled) if self.learn == "shared" else settled
 
-    def _model(self, fields: Fields, noise: Tensor) -> Model:
+    def _model(self, fields: Fields, noise: Tensor) -> Problem:
         """Everything that stays the same during the iterations."""
         gradient, mask = fields.gradient, fields.mask
         shape, N = gradient.shape[-2:], gradient.shape[0]
@@ -316,9 +330,9 @@ class DLS(Iterative[DLSResult]):
         if mask is None:
             if self.patches.tile(shape):  # one number, with which the height is one direct solve
                 coverage = coverage[..., :1, :1]
-            return Model(fields, self.patches, coverage, None, edges, noise, lam, mu)
+            return Problem(fields, self.patches, coverage, None, edges, noise, lam, mu)
         valid = self.patches.extract(mask.to(gradient.dtype)) > 0
-        return Model(fields, self.patches, coverage * mask, valid.expand(N, -1, -1), edges, noise, lam, mu)
+        return Problem(fields, self.patches, coverage * mask, valid.expand(N, -1, -1), edges, noise, lam, mu)
 
     def _noise(self, fields: Fields) -> Tensor:
         """(N,) noise of a gradient sample of mean weight; NaN where it cannot be told and mu does not need it."""
@@ -350,7 +364,7 @@ class DLS(Iterative[DLSResult]):
         D = D / D.norm(dim=1, keepdim=True)
         return D.expand(N, -1, -1) if self.learn == "each" else D
 
-    def _step(self, model: Model, z: Tensor, folded: Tensor) -> Tensor:
+    def _step(self, model: Problem, z: Tensor, folded: Tensor) -> Tensor:
         """The height for given patches D B = P - R, with R folded."""
         fields = model.fields
         v, w = model.edges or self.data_term.edges(fields, z)
@@ -371,7 +385,7 @@ class DLS(Iterative[DLSResult]):
             z = (z - tau * slope + tau * pull) / (1 + tau * weight)
         return z
 
-    def _objective(self, model: Model, state: State) -> Tensor:
+    def _objective(self, model: Problem, state: State) -> Tensor:
         """(N,) value of the cost, for heights in pixels."""
         fields, z = model.fields, state.z
         cost = self.data_term.data_cost(fields, z) if model.edges is None else edge_cost(z, *model.edges, fields.steps)

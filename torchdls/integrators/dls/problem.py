@@ -15,7 +15,7 @@ from torchdls.operators import Patches
 _AT_ONCE = 2**20
 
 
-class Model(NamedTuple):
+class Problem(NamedTuple):
     """The constants of one run.
 
     coverage (1 or N, 1, H, W) is counted within the mask; valid (N, n, L) marks the valid pixels of the patches; edges
@@ -31,9 +31,9 @@ class Model(NamedTuple):
     lam: Tensor
     mu: Tensor
 
-    def part(self, keep: Tensor) -> Model:
+    def select(self, keep: Tensor) -> Problem:
         """The model of some surfaces of the batch; what all share stays as it is."""
-        return Model(*(_select(value, keep) for value in self))
+        return Problem(*(_select(value, keep) for value in self))
 
 
 class State(NamedTuple):
@@ -45,7 +45,7 @@ class State(NamedTuple):
     D: Tensor
     B: Tensor
 
-    def part(self, keep: Tensor) -> State:
+    def select(self, keep: Tensor) -> State:
         """The state of some surfaces of the batch."""
         return State(*(_select(value, keep) for value in self))
 
@@ -55,7 +55,7 @@ class State(NamedTuple):
         return State(*(n if len(n) < len(active) else torch.where(_over(active, n), n, o) for o, n in pairs))
 
 
-class Part(NamedTuple):
+class Finished(NamedTuple):
     """Surfaces of the batch that stopped at the same iteration, and where."""
 
     surfaces: Tensor
@@ -75,7 +75,7 @@ def _over(active: Tensor, t: Tensor) -> Tensor:
     return active.view(-1, *[1] * (t.ndim - 1))
 
 
-def merge(parts: list[Part]) -> State:
+def merge(parts: list[Finished]) -> State:
     """All surfaces in the order in which they came."""
     if len(parts) == 1:
         return parts[0].state
@@ -94,16 +94,16 @@ def patch_cost(R: Tensor, B: Tensor, mu: Tensor, valid: Tensor | None, rule: Thr
     return fit + total_penalty(B, mu, rule)
 
 
-def worthwhile(bare: Tensor, R: Tensor, B: Tensor, mu: Tensor, rule: Threshold) -> tuple[Tensor, Tensor]:
+def drop_costly_codes(bare: Tensor, R: Tensor, B: Tensor, mu: Tensor, rule: Threshold) -> tuple[Tensor, Tensor]:
     """Residual and codes after the first sweep; patches that are better off without codes keep their bare residual.
 
     That sweep also fits the heights continued beyond the mask, which the objective does not count.
     """
-    pays = pays_off(bare, R, B, mu, rule)
+    pays = codes_pay(bare, R, B, mu, rule)
     return torch.where(pays, R, bare), torch.where(pays, B, 0)
 
 
-def pays_off(bare: Tensor, R: Tensor, B: Tensor, mu: Tensor, rule: Threshold) -> Tensor:
+def codes_pay(bare: Tensor, R: Tensor, B: Tensor, mu: Tensor, rule: Threshold) -> Tensor:
     """(N, 1, L) bool: the patches that cost less, or as much, with their codes as without."""
     cost = R.square().sum(1, keepdim=True) + penalty(B, mu[:, None, None], rule).sum(1, keepdim=True)
     return cost <= bare.square().sum(1, keepdim=True)
