@@ -1,0 +1,91 @@
+"""Several heights of the same data blended by Stein's unbiased estimate of the risk."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import torch
+from torch import Tensor
+
+from torchdls.noise import height_noise
+from torchdls.operators import dct2
+
+
+def sure_weights(
+    heights: Tensor,
+    changes: Tensor,
+    reference: Tensor,
+    moved: Tensor,
+    noise: Tensor,
+    pixel_size: tuple[float, float] = (1.0, 1.0),
+    norm: float = 0.25,
+) -> Tensor:
+    r"""Weights w >= 0, sum w <= 1, of z_ls + sum_m w_m (z_m - z_ls) with the least predicted risk.
+
+        minimise 1/2 w^T G w + b^T w,   G_mn = sum W D_m D_n,   b_m = sigma^2 sum W dct2(C_m - a) dct2(a)
+        D_m = dct2(z_m - z_ls),   W = S^-norm, 0 for the mean
+
+    with S the variance that white noise leaves in the coefficients of z_ls, C_m the derivative of z_m along the probe
+    and a that of z_ls. With norm = 0 the risk is the squared error of the height, with 1 all coefficients count by
+    their own noise.
+
+    Args:
+        heights: (M, N, 1, H, W), on full rectangles with equal trust.
+        changes: (M, N, 1, H, W), their derivatives along the probe.
+        reference: (N, 1, H, W), the least-squares height.
+        moved: (N, 1, H, W), its derivative along the probe.
+        noise: (N,) standard deviation of one gradient sample.
+        pixel_size: (dx, dy).
+        norm: 0 to 1.
+
+    Returns:
+        (N, M), without a derivative: a choice.
+
+    Source: Stein (1981); Ramani, Blu, Unser, "Monte-Carlo SURE", IEEE TIP 17(9), 2008.
+    """
+    shape = (reference.shape[-2], reference.shape[-1])
+    variance = height_noise(shape, reference, pixel_size)
+    weight = torch.where(variance > 0, torch.where(variance > 0, variance, 1).pow(-norm), 0)
+    push = dct2(moved.detach())
+    D = dct2((heights - reference).detach()).movedim(0, 1).flatten(2)
+    along = (weight * push * dct2((changes - moved).detach())).movedim(0, 1).flatten(2).sum(2)
+    G = (D * weight.flatten()) @ D.mT
+    b = noise.detach().square()[:, None] * along
+    scale = G.diagonal(dim1=1, dim2=2).mean(1)
+    scale = torch.where(scale > 0, scale, 1)
+    return least_in_simplex((G / scale[:, None, None]).double(), (b / scale[:, None]).double()).to(reference)
+
+
+def least_in_simplex(G: Tensor, b: Tensor) -> Tensor:
+    r"""The w >= 0, sum w <= 1 with the least 1/2 w^T G w + b^T w, by trying every set of positive weights.
+
+    Args:
+        G: (N, M, M) positive semidefinite, M small: 2^(M+1) systems of at most M + 1 equations are solved.
+        b: (N, M).
+
+    Returns:
+        (N, M).
+    """
+    n, m = b.shape
+    ridge = 1e-9 * torch.eye(m, dtype=G.dtype, device=G.device)
+    best, least = torch.zeros_like(b), torch.zeros_like(b[:, 0])
+    for size in range(1, m + 1):
+        for chosen in combinations(range(m), size):
+            rows = torch.tensor(chosen, device=G.device)
+            for full in (False, True):
+                part = _stationary((G + ridge)[:, rows][:, :, rows], b[:, rows], full)
+                w = torch.zeros_like(b).index_copy(1, rows, part)
+                cost = 0.5 * (w[:, None] @ G @ w[:, :, None]).flatten() + (b * w).sum(1)
+                better = (part >= 0).all(1) & (w.sum(1) <= 1 + 1e-6) & (cost < least)
+                best, least = torch.where(better[:, None], w, best), torch.where(better, cost, least)
+    return best
+
+
+def _stationary(G: Tensor, b: Tensor, full: bool) -> Tensor:
+    """Where 1/2 w^T G w + b^T w is stationary, among all w or among those of sum 1."""
+    solved = torch.linalg.solve(G, torch.stack([-b, torch.ones_like(b)], 2))
+    free, direction = solved.unbind(2)
+    if not full:
+        return free
+    along = direction.sum(1, keepdim=True)
+    return free + direction * (1 - free.sum(1, keepdim=True)) / along

@@ -1,0 +1,118 @@
+"""One run: slopes coded by cosines and polynomials at many scales, with a threshold that falls from step to step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchdls.integrators.slope_dls.bases import Places
+from torchdls.integrators.slope_dls.coding import Coded, average
+from torchdls.operators import GradientOperator, edge_slopes
+from torchdls.operators.edges import extend_edges
+from torchdls.selection import discrepancy_guard
+from torchdls.solvers import solve
+
+_KAPPA = 25.0  # trust in the coded slopes, as a multiple of that in the measured ones
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one run does.
+
+    Args:
+        sizes: sides of the patches; those that do not fit the image are left out.
+        whole: the largest square that fits is a patch too.
+        tau: first and last threshold, in standard deviations of each coefficient; linear in between.
+        weights: of a patch with K kept coefficients in the average: "size" is size^2 / (1 + K), the inverse variance
+            of its pixels; "count" 1 / (1 + K); "equal" 1.
+        turned: code the slopes along the diagonals, (p + q, p - q) / sqrt 2.
+        smooth: polynomials in the bases of patches from 16 pixels on.
+        n_iter: number of iterations.
+    """
+
+    sizes: tuple[int, ...] = (4, 8, 16, 32, 64)
+    whole: bool = True
+    tau: tuple[float, float] = (1.6, 0.3)
+    weights: Literal["size", "count", "equal"] = "size"
+    turned: bool = False
+    smooth: bool = True
+    n_iter: int = 8
+
+    def places(self, shape: tuple[int, int], iteration: int) -> list[Places]:
+        """The patches of an iteration."""
+        side = min(shape)
+        sizes = [s for s in self.sizes if s <= side]
+        if (self.whole and side not in sizes) or not sizes:
+            sizes.append(side)
+        return [Places.at(iteration, shape, size, self.smooth) for size in sizes]
+
+    def threshold(self, iteration: int) -> float:
+        """tau of an iteration."""
+        first, last = self.tau
+        return first + (last - first) * iteration / max(1, self.n_iter - 1)
+
+    def heights(
+        self, gradient: Tensor, start: Tensor, noise: Tensor, steps: tuple[float, float], guard: bool
+    ) -> Iterator[Tensor]:
+        """The height (N, 1, H, W) after each iteration, on a full rectangle with equal trust.
+
+        Args:
+            gradient: (N, 2, H, W).
+            start: (N, 1, H, W), the least-squares height.
+            noise: (N,) standard deviation of one gradient sample.
+            steps: (dx, dy).
+            guard: give back what was removed beyond the noise (`discrepancy_guard`).
+        """
+        v, a, z = edge_slopes(gradient)[0], GradientOperator("forward", steps), start
+        for iteration in range(self.n_iter):
+            coded = self.code(extend_edges(a(z)), noise, steps, iteration)
+            z = solve((v + _KAPPA * coded) / (1 + _KAPPA), pixel_size=steps).height
+            z = discrepancy_guard(z, start, noise, steps) if guard else z
+            yield z
+
+    def code(self, slopes: Tensor, noise: Tensor, steps: tuple[float, float], iteration: int) -> Tensor:
+        """The mean of all estimates of all patches, (N, 2, H, W)."""
+        tau, shape = self.threshold(iteration), (slopes.shape[-2], slopes.shape[-1])
+        slopes = _turn(slopes) if self.turned else slopes
+        parts = []
+        for places in self.places(shape, iteration):
+            part = self._code(places, slopes, tau * noise[:, None, None, None], steps)
+            if self.turned:  # turning back mixes the two components, so they must share one weight
+                weight = part.weight.mean(1, keepdim=True)
+                part = Coded(_turn(part.total / part.weight) * weight, weight)
+            parts.append(part)
+        return average(parts)
+
+    def _code(self, places: Places, slopes: Tensor, level: Tensor, steps: tuple[float, float]) -> Coded:
+        coefficients = places.analyse(slopes)
+        kept = coefficients.abs() > level * places.noise(slopes, steps, self.turned)
+        coefficients = torch.where(kept, coefficients, 0)
+        if self.weights == "equal":
+            one = torch.ones_like(places.patchwise(coefficients)[:1, :1, :, 0, :, 0])
+            return Coded(places.synthesise(coefficients), places.spread(one))
+        count = places.patchwise(kept).sum((-3, -1))
+        weight = (places.size**2 if self.weights == "size" else 1) / (1 + count).to(slopes.dtype)
+        weighted = (places.patchwise(coefficients) * weight[..., :, None, :, None]).view_as(coefficients)
+        return Coded(places.synthesise(weighted), places.spread(weight))
+
+
+RunOf = Callable[[Tensor, Tensor], Tensor]
+
+FOUR = (
+    Run(),
+    Run(turned=True),
+    Run(sizes=(8, 16, 32, 64), tau=(1.8, 0.3), weights="equal"),
+    Run(sizes=(4, 8, 16), whole=False, weights="count", smooth=False),
+)
+QUICK = Run(sizes=(8, 16, 32, 64), tau=(1.8, 0.3), weights="equal")
+
+
+def _turn(slopes: Tensor) -> Tensor:
+    """(p + q, p - q) / sqrt 2, which is its own inverse."""
+    p, q = slopes[:, :1], slopes[:, 1:]
+    return torch.cat([p + q, p - q], 1) / math.sqrt(2)
