@@ -65,7 +65,6 @@ METHODS: dict[str, Method] = {
     "slope_dls": Method(
         {"patch_sizes": (4, 8), "n_iter": 3},
         tol=1e-4,
-        smallest=2,
         no={
             "components_are_independent": "they share one dictionary",
             "follows_flips": "the grid of the patches shifts to one side",

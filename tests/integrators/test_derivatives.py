@@ -39,7 +39,7 @@ def dls(**options: Any) -> Callable[[], Integrator]:
 
 
 def slope_dls(**options: Any) -> Callable[[], Integrator]:
-    settings: dict[str, Any] = {"patch_sizes": (3, 5), "tau": 0.8, "n_iter": 2, "z_tol": 1e-13}
+    settings: dict[str, Any] = {"recipe": "plain", "patch_sizes": (3, 5), "tau": 0.8, "n_iter": 2, "z_tol": 1e-13}
     return lambda: SlopeDLS(**(settings | options))
 
 
@@ -75,6 +75,7 @@ VARIANTS: dict[str, dict[str, Callable[[], Integrator]]] = {
     },
     "slope_dls": {
         "default": slope_dls(),
+        "quick": slope_dls(recipe="quick"),
         "cosines": slope_dls(learn=False, aggregate="sparsity", pixel_size=(0.5, 1.5)),
     },
 }

@@ -11,7 +11,9 @@ from torchdls.noise import cosine_noise, height_noise, slope_covariance
 from torchdls.operators import GradientOperator, dct2
 from torchdls.selection import discrepancy_guard
 
-QUICK = {"tau": 1.2, "n_iter": 6}  # the recipe for fewer iterations
+QUICK = {"recipe": "plain", "tau": 1.2, "n_iter": 6}  # one threshold, fewer iterations
+PLAIN = {"recipe": "plain"}
+RECIPES = pytest.mark.parametrize("recipe", ["blend", "quick", "plain"])
 
 
 def noisy(name="tent", n=64, snr=10, seed=0, dtype=torch.float64):
@@ -47,39 +49,46 @@ def test_fast_variant_and_texture():
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (5, 9), (31, 50), (64, 3)])
-@pytest.mark.parametrize("learn", [True, False])
-def test_any_size(shape, learn):
+@pytest.mark.parametrize("options", [PLAIN, PLAIN | {"learn": False}, {}, {"recipe": "quick"}])
+def test_any_size(shape, options):
     gradient = random_field(2, 2, *shape)
-    height = SlopeDLS(learn=learn, n_iter=3)(gradient)
+    height = SlopeDLS(n_iter=3, **options)(gradient)
     assert height.shape == (2, 1, *shape)
     assert height.isfinite().all()
     assert height.mean((1, 2, 3)).abs().max() < 1e-9
 
 
-def test_plane_is_exact_and_scale_is_followed():
+@RECIPES
+def test_plane_is_exact_and_scale_is_followed(recipe):
+    method = SlopeDLS(n_iter=4, recipe=recipe)
     plane = torch.tensor([0.3, -0.2], dtype=torch.float64)[None, :, None, None].expand(1, 2, 40, 30)
-    torch.testing.assert_close(SlopeDLS(n_iter=4)(plane), LeastSquares()(plane), atol=1e-9, rtol=0)
+    torch.testing.assert_close(method(plane), LeastSquares()(plane), atol=1e-9, rtol=0)
     _, gradient = noisy(n=32)
-    height = SlopeDLS(n_iter=4)(gradient)
-    torch.testing.assert_close(SlopeDLS(n_iter=4)(1e-3 * gradient), 1e-3 * height)
-    torch.testing.assert_close(SlopeDLS(n_iter=4, pixel_size=2.5)(gradient), 2.5 * height)
+    height = method(gradient)
+    torch.testing.assert_close(method(1e-3 * gradient), 1e-3 * height)
+    torch.testing.assert_close(SlopeDLS(n_iter=4, recipe=recipe, pixel_size=2.5)(gradient), 2.5 * height)
 
 
-def test_zero_threshold_and_zero_iterations_are_least_squares():
+@RECIPES
+def test_zero_threshold_and_zero_iterations_are_least_squares(recipe):
     _, gradient = noisy(n=40)
     plain = LeastSquares()(gradient)
-    torch.testing.assert_close(SlopeDLS(n_iter=0)(gradient), plain)
-    torch.testing.assert_close(SlopeDLS(tau=0.0, learn=False, n_iter=2)(gradient), plain, atol=1e-8, rtol=0)
+    torch.testing.assert_close(SlopeDLS(n_iter=0, recipe=recipe)(gradient), plain)
+    kept = SlopeDLS(tau=0.0, learn=False, n_iter=2, recipe=recipe)(gradient)
+    torch.testing.assert_close(kept, plain, atol=1e-8, rtol=0)
 
 
 def test_result_and_callback():
     _, gradient = noisy(n=32)
     seen = []
-    result = SlopeDLS(n_iter=3).solve(gradient[0], callback=lambda k, m: seen.append((k, float(m))))
-    assert isinstance(result, SlopeDLSResult)
-    torch.testing.assert_close(result.height[0], SlopeDLS(n_iter=3)(gradient[0]))
-    assert result.misfit.shape == (1, 4)
-    assert seen == [(k, float(result.misfit[0, k])) for k in (1, 2, 3)]
+    for recipe in ("blend", "quick", "plain"):
+        seen.clear()
+        method = SlopeDLS(n_iter=3, recipe=recipe)
+        result = method.solve(gradient[0], callback=lambda k, m: seen.append((k, float(m))))
+        assert isinstance(result, SlopeDLSResult)
+        torch.testing.assert_close(result.height[0], method(gradient[0]))
+        assert result.misfit.shape == (1, 4)
+        assert seen == [(k, float(result.misfit[0, k])) for k in (1, 2, 3)]
     assert result.dictionary.shape == (1, 128, 128)
     torch.testing.assert_close(result.dictionary.norm(dim=1), torch.ones(1, 128, dtype=torch.float64))
     assert result.codes.shape[:2] == (1, 128)
@@ -87,7 +96,10 @@ def test_result_and_callback():
     assert SlopeDLS(learn=False, n_iter=1).solve(gradient).dictionary is None
 
 
-@pytest.mark.parametrize("options", [{}, {"learn": False}, {"guard": "sure"}, {"robust": True}])
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"recipe": "plain"}, PLAIN | {"learn": False}, PLAIN | {"guard": "sure"}, {"recipe": "quick", "robust": True}],
+)
 def test_batch_equals_single_and_calls_repeat(options):
     gradient = torch.cat([noisy(n=32, seed=k, snr=s)[1] for k, s in ((0, 1), (1, 20))])
     mask = torch.cat([torch.ones(1, 1, 32, 32, dtype=torch.bool), DISK(32, 32)])
@@ -229,7 +241,7 @@ def test_guard_returns_what_is_not_noise():
 
 def test_stein_guard_does_no_harm():
     surface, gradient = noisy("ripples", 48, 5)
-    over = {"tau": 4.0, "n_iter": 6, "guard": None}  # smooths far too much
+    over = {"recipe": "plain", "tau": 4.0, "n_iter": 6, "guard": None}  # smooths far too much
     bad, saved = SlopeDLS(**over), SlopeDLS(**(over | {"guard": "sure"}))
     assert gain(surface, gradient, saved) > 0.97
     assert gain(surface, gradient, saved) > gain(surface, gradient, bad)
@@ -244,6 +256,7 @@ def test_stein_guard_does_no_harm():
         ({"n_iter": -1}, "n_iter"),
         ({"guard": "luck"}, "guard"),
         ({"aggregate": "median"}, "aggregate"),
+        ({"recipe": "secret"}, "recipe"),
         ({"sigma": -1.0}, "sigma"),
         ({"sigma": torch.ones(3)}, "sigma"),
         ({"sigma": torch.ones(1, 1, 3, 3)}, "sigma"),

@@ -1,4 +1,4 @@
-"""Square patches at places clipped into the image: their orthonormal bases, and the exact noise of every coefficient."""
+"""Square patches at places clipped into the image: orthonormal bases, and the exact noise of every coefficient."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Places:
 
     def _forward(self, x: Tensor, positions: tuple[int, ...]) -> Tensor:
         index, atoms = _samples(self.size, positions, like=x), _atoms(self.size, self.smooth, like=x)
-        return (x[..., index].unflatten(-1, (-1, self.size)) @ atoms.mT).flatten(-2)
+        return (x.index_select(-1, index).unflatten(-1, (-1, self.size)) @ atoms.mT).flatten(-2)
 
     def _backward(self, c: Tensor, positions: tuple[int, ...], n: int) -> Tensor:
         atoms = _atoms(self.size, self.smooth, like=c)
@@ -99,7 +99,7 @@ class Places:
         if len(positions) == 1:
             return patches
         index = _owners(n, self.size, positions, like=c)
-        return torch.nn.functional.pad(patches, (0, 1))[..., index].unflatten(-1, (-1, n)).sum(-2)
+        return torch.nn.functional.pad(patches, (0, 1)).index_select(-1, index).unflatten(-1, (-1, n)).sum(-2)
 
 
 def _positions(n: int, size: int, offset: int) -> tuple[int, ...]:
@@ -161,13 +161,15 @@ def _build_noise(
 
 def _seen(n: int, size: int, offset: int, smooth: bool, double: Tensor) -> tuple[Tensor, Tensor]:
     """What each placed atom sees of each cosine mode, and of its differences: T M^T and T E M^T."""
-    positions, atoms, modes = _positions(n, size, offset), _atoms(size, smooth, like=double), cosine_matrix(n, like=double)
+    positions, atoms, modes = (
+        _positions(n, size, offset),
+        _atoms(size, smooth, like=double),
+        cosine_matrix(n, like=double),
+    )
     difference = modes.diff(dim=1)
     last = difference[:, -1:] if n > 1 else torch.zeros_like(modes)
     difference = torch.cat([difference, last], 1)
-    value, slope = (
-        torch.cat([atoms @ m[:, p : p + size].mT for p in positions]) for m in (modes, difference)
-    )
+    value, slope = (torch.cat([atoms @ m[:, p : p + size].mT for p in positions]) for m in (modes, difference))
     return value, slope
 
 

@@ -18,7 +18,7 @@ def sure_weights(
     moved: Tensor,
     noise: Tensor,
     pixel_size: tuple[float, float] = (1.0, 1.0),
-    norm: float = 0.25,
+    norm: float = 0.5,
 ) -> Tensor:
     r"""Weights w >= 0, sum w <= 1, of z_ls + sum_m w_m (z_m - z_ls) with the least predicted risk.
 
@@ -66,7 +66,7 @@ def least_in_simplex(G: Tensor, b: Tensor) -> Tensor:
     Returns:
         (N, M).
     """
-    n, m = b.shape
+    m = b.shape[1]
     ridge = 1e-9 * torch.eye(m, dtype=G.dtype, device=G.device)
     best, least = torch.zeros_like(b), torch.zeros_like(b[:, 0])
     for size in range(1, m + 1):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, Self
 
 import torch
@@ -15,6 +16,7 @@ from torchdls.integrators.fields import even, largest
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.slope_dls.coding import Aggregate, Noise, SlopeScale, average
 from torchdls.integrators.slope_dls.outliers import replace_outliers
+from torchdls.integrators.slope_dls.runs import FOUR, QUICK, Run, smooth
 from torchdls.noise import noise_level
 from torchdls.operators import GradientOperator, edge_slopes
 from torchdls.operators.edges import edge_ends, extend_edges
@@ -22,6 +24,7 @@ from torchdls.selection import discrepancy_guard, probe, sure_guard
 from torchdls.solvers import harmonic_extension, solve
 
 Guard = Literal["discrepancy", "sure"]
+Recipe = Literal["blend", "quick", "plain"]
 
 _KAPPA = 25.0  # trust in the coded slopes, as a multiple of that in the measured ones
 
@@ -34,7 +37,8 @@ class SlopeDLSResult(NamedTuple):
         dictionary: (N, 2n, K) learned atoms of the smallest patches, the slope in x above that in y; None if
             nothing is learned.
         codes: (N, K, L) of the last iteration, in the unit of the slopes, or None likewise.
-        misfit: (N, n_iter + 1), 1/2 sum_e w_e ((A z)_e - v_e)^2 of least squares and after each iteration.
+        misfit: (N, n_iter + 1), 1/2 sum_e w_e ((A z)_e - v_e)^2 of least squares and after each iteration (of the first
+            run, where there are several; where surfaces of a batch take unequal numbers, the last one repeats).
         noise: (N,) standard deviation of one gradient sample of weight 1.
         confidence: (N, 1, H, W): 0 where `robust` replaced a sample, else 1; 0 outside the mask.
     """
@@ -47,45 +51,72 @@ class SlopeDLSResult(NamedTuple):
     confidence: Tensor
 
 
+@dataclass(frozen=True)
+class _Plain:
+    """Settings of the recipe "plain", which also serves surfaces with holes, unequal weights or anchors."""
+
+    patch_sizes: tuple[int, ...] = (8, 24, 48)
+    tau: float = 0.8
+    n_iter: int = 16
+    learn: bool = True
+    aggregate: Aggregate = "mean"
+
+
+_PLAIN = {"blend": _Plain(), "plain": _Plain(), "quick": _Plain((8, 16, 32), 2.7, 1, False, "sparsity")}
+_RUNS: dict[str, tuple[Run, ...]] = {"blend": FOUR, "quick": QUICK, "plain": ()}
+
+
 class SlopeDLS(Iterative[SlopeDLSResult]):
-    r"""Dictionary learning on the slopes at several scales, with nothing to tune.
+    r"""Sparse coding of the slopes at several scales, with nothing to tune.
 
     The noise of the data is white in the slopes, and integration colours it in a known way. So the slopes are what is
-    coded sparsely, and every atom gets the threshold that its own noise asks for. From the least-squares height on,
-    each iteration
+    coded sparsely, and every coefficient gets the threshold that its own noise asks for. From the least-squares height
+    on, each iteration
 
-    1. cuts the slopes A z into overlapping patches of several sizes. Those of the smallest size hold both components
-       and go through one sweep of SOUP-DIL, which learns their dictionary; the larger ones, which see slowly varying
-       slopes, keep those cosine coefficients that exceed tau sigma s_k, with s_k the noise of coefficient k in the
-       projected slopes for white noise of level 1 (`cosine_noise`);
-    2. averages the estimates of all patches to slopes u;
+    1. cuts the slopes A z into overlapping patches of 4, 8, 16, 32, 64 pixels and the whole image, and keeps those
+       coefficients (cosines, in patches from 16 pixels on after polynomials up to degree 5) that exceed tau sigma s_k,
+       s_k the exact noise of coefficient k at its place;
+    2. averages the estimates of all patches to slopes u, each patch with the inverse variance of its pixels,
+       size^2 / (1 + kept coefficients);
     3. integrates them, by the solve (*): z = argmin 1/2 sum_e w_e ((A z)_e - v'_e)^2 + anchors, with
        v' = (v + 25 u) / 26;
     4. gives back, in every band of frequencies, what was removed beyond the noise (`discrepancy_guard`).
 
-    The grid of the larger patches shifts from one iteration to the next; that of the smallest stays, and its codes go
-    on from those of the last sweep. The number of iterations is early stopping and part of the recipe.
+    tau falls from 1.6 to 0.3 over 8 iterations, and the grid of the patches shifts from one to the next. The recipe
+    "blend" does so in four ways (along rows and columns, along the diagonals, with equal weights, and with small
+    patches alone), and blends the four heights by Stein's unbiased risk estimate from a second round on probed data.
+    At last, cosine modes of the height of periods above 32 pixels, which patches hardly see, are shrunk
+    (`shrink_slow_waves`), and where little of the noise was found, as on texture, least squares is returned
+    (`cautious`). "quick" is one run of 6 iterations with
+    equal weights, about a tenth of the work.
 
-    With a mask, slopes outside are filled by the last estimate u (at first by those of the harmonic extension).
-    Weights are inverse relative variances: each patch is coded in units of its own noise. Step 4 then is left out for
-    the surfaces of the batch that have holes, unequal weights or anchors, where the spectrum of the noise is not known
-    exactly.
+    "plain" codes sizes 8, 24, 48 with one threshold, from the noise that atoms see far from the border; patches of the
+    smallest size hold both components and go through one sweep of SOUP-DIL, which learns their dictionary. It also
+    serves the surfaces of a batch with holes, unequal weights or anchors, whatever the recipe, since there the noise
+    of the height is not known exactly; step 4 then is left out. With a mask, slopes outside are filled by the last
+    estimate u (at first by those of the harmonic extension). Weights are inverse relative variances: each patch is
+    coded in units of its own noise.
 
-    Differentiable by unrolling, with the supports of the codes held fixed. Heights, weights and
-    thresholds refer to heights in pixels, so they mean the same at every pixel size.
+    Differentiable by unrolling, with choices held fixed: the supports of the codes, the weights of the blend, the
+    shares of the thresholds of slow waves and of least squares. Heights, weights and thresholds refer to heights in
+    pixels, so they mean the same at every pixel size.
 
     Args:
-        patch_sizes: sides of the patches, the smallest first; those that do not fit the image are left out.
-        tau: threshold in standard deviations of the noise of an atom. Below 1, since every iteration thresholds again;
-            1.2 with 9 iterations is as good in noise and quicker, but blurs smooth surfaces above 30 dB.
+        patch_sizes: sides of the patches; those that do not fit the image are left out. None for those of the recipe,
+            and so for the next four.
+        tau: threshold in standard deviations of the noise of a coefficient, the same in all iterations.
         n_iter: number of iterations.
-        learn: learn the dictionary of the smallest patches; False codes them by cosines too, in a third of the time.
+        learn: "plain" alone: learn the dictionary of the smallest patches; False codes them by cosines too.
+        recipe: "blend", "quick" or "plain".
         sigma: standard deviation of one gradient sample of weight 1: a number, (N,), or a map (N, 1, H, W), which takes
-            the place of the weights in the coding. None estimates it with `noise_level`.
-        guard: "discrepancy" (step 4); "sure" adds at the end a blend with least squares by Stein's unbiased risk
-            estimate, from a second run on probed data (twice the time); None for neither.
+            the place of the weights in the coding. None estimates it with `noise_level`; fields of a single row or
+            column, which do not show it, are then integrated as they are.
+        guard: "discrepancy" (step 4, and the return to least squares); "sure" adds at the end a blend with least
+            squares in every band by Stein's unbiased risk estimate, from a second run on probed data (twice the time);
+            None for neither.
         robust: look for grossly wrong samples first and replace them (`replace_outliers`); for a few percent of them.
-        aggregate: weights of the patches in the average: "mean", or "sparsity", 1 / (1 + number of coefficients).
+        aggregate: "plain" alone: weights of the patches in the average: "mean", or "sparsity", 1 / (1 + number of
+            coefficients).
         z_tol: relative residual of the heights where no direct solve serves.
         pixel_size: (dx, dy) or one number; heights come out in its unit.
 
@@ -93,48 +124,68 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         ValueError: an option is unknown or out of range, or `sigma` does not fit the gradient.
 
     Source: an extension of Wagenmaker, Moore, Nadakuditi (ICIP 2017); the noise of transform coefficients after Donoho,
-    Johnstone (1994), the shifts after Coifman, Donoho (1995), "Translation-invariant de-noising".
+    Johnstone (1994), the shifts after Coifman, Donoho (1995), "Translation-invariant de-noising", the blend after
+    Ramani, Blu, Unser (2008), the slow waves after Karacali, Snyder (2004).
     """
 
     def __init__(
         self,
-        patch_sizes: Sequence[int] = (8, 24, 48),
-        tau: float = 0.8,
-        n_iter: int = 16,
-        learn: bool = True,
+        patch_sizes: Sequence[int] | None = None,
+        tau: float | None = None,
+        n_iter: int | None = None,
+        learn: bool | None = None,
         *,
+        recipe: Recipe = "blend",
         sigma: float | Tensor | None = None,
         guard: Guard | None = "discrepancy",
         robust: bool = False,
-        aggregate: Aggregate = "mean",
+        aggregate: Aggregate | None = None,
         z_tol: float = 1e-5,
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(pixel_size=pixel_size)
-        self.patch_sizes = tuple(patch_sizes)
-        if not self.patch_sizes or not all(isinstance(s, int) and s >= 2 for s in self.patch_sizes):
+        if recipe not in _PLAIN:
+            raise ValueError(f"SlopeDLS: recipe={recipe!r} given; choose from 'blend', 'quick', 'plain'")
+        self.patch_sizes = None if patch_sizes is None else tuple(patch_sizes)
+        sizes = (8,) if self.patch_sizes is None else self.patch_sizes
+        if not sizes or not all(isinstance(s, int) and s >= 2 for s in sizes):
             raise ValueError(f"SlopeDLS: patch_sizes={patch_sizes!r} given, integers of at least 2 are needed")
-        if not isinstance(n_iter, int) or n_iter < 0:
+        if n_iter is not None and (not isinstance(n_iter, int) or n_iter < 0):
             raise ValueError(f"SlopeDLS: n_iter={n_iter!r} given, an integer of at least 0 is needed")
-        if not tau >= 0 or not z_tol > 0:
+        if (tau is not None and not tau >= 0) or not z_tol > 0:
             raise ValueError(f"SlopeDLS: tau={tau!r} must not be negative, z_tol={z_tol!r} must be positive")
-        if guard not in ("discrepancy", "sure", None) or aggregate not in ("mean", "sparsity"):
-            known = "guard: 'discrepancy', 'sure', None; aggregate: 'mean', 'sparsity'"
+        if guard not in ("discrepancy", "sure", None) or aggregate not in ("mean", "sparsity", None):
+            known = "guard: 'discrepancy', 'sure', None; aggregate: 'mean', 'sparsity', None"
             raise ValueError(f"SlopeDLS: guard={guard!r}, aggregate={aggregate!r} given; choose from {known}")
         if sigma is not None and not bool((torch.as_tensor(sigma) >= 0).all()):
             raise ValueError(f"SlopeDLS: sigma={sigma!r} given, at least 0 is needed")
         self.tau, self.n_iter, self.learn, self.aggregate = tau, n_iter, learn, aggregate
-        self.sigma, self.guard, self.robust, self.z_tol = sigma, guard, robust, z_tol
+        self.recipe, self.sigma, self.guard, self.robust, self.z_tol = recipe, sigma, guard, robust, z_tol
 
     @classmethod
     def fast(cls, **options: Any) -> Self:
-        """The variant without iteration, for real time: one pass over sizes 8, 16, 32 by cosines.
+        """The recipe "quick"; with a mask, weights or anchors one pass over sizes 8, 16, 32 by cosines.
 
         Args:
             options: of the class, in the place of those of the variant.
         """
-        recipe: dict[str, Any] = {"tau": 2.7, "n_iter": 1, "learn": False, "aggregate": "sparsity"}
-        return cls(**({"patch_sizes": (8, 16, 32)} | recipe | options))
+        return cls(**({"recipe": "quick"} | options))
+
+    def _given(self) -> dict[str, Any]:
+        """The options that take the place of those of the recipe."""
+        names = ("patch_sizes", "tau", "n_iter", "learn", "aggregate")
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
+
+    def _runs(self) -> list[Run]:
+        """The runs of the recipe with the options given."""
+        given: dict[str, Any] = {}
+        if self.patch_sizes is not None:
+            given |= {"sizes": self.patch_sizes, "whole": False}
+        if self.tau is not None:
+            given["tau"] = (self.tau, self.tau)
+        if self.n_iter is not None:
+            given["n_iter"] = self.n_iter
+        return [replace(run, **given) for run in _RUNS[self.recipe]]
 
     def in_units(self, result: SlopeDLSResult) -> SlopeDLSResult:
         """The height in the unit of `pixel_size`; slopes and their codes have none."""
@@ -149,29 +200,63 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
             gradient, outliers = replace_outliers(fields, tol=self.z_tol)
             fields, trusted = fields._replace(gradient=gradient), torch.where(outliers, 0, trusted)
         noise = self._noise(fields)
-        result = self._run(fields, noise, callback)
+        result = self._smooth(fields, noise, callback)
         if self.guard == "sure":
             result = result._replace(height=self._blend(fields, noise, result.height))
         return result._replace(confidence=trusted.expand(noise.level.shape[0], -1, -1, -1))
 
-    def _run(self, fields: Fields, noise: Noise, callback: Callback | None = None) -> SlopeDLSResult:
+    def _smooth(self, fields: Fields, noise: Noise, callback: Callback | None = None) -> SlopeDLSResult:
+        """Each surface by the recipe or, where the noise of its height is not known exactly, plainly."""
+        bare = fields.mask is None and fields.anchor_weight is None and noise.trust is None
+        known = bare or visible(noise.even)
+        if self.recipe == "plain" or (known and not bare and not bool(noise.even.any())):
+            return self._plain(fields, noise, callback)
+        exact = self._exact(fields, noise, callback)
+        if bare or (known and bool(noise.even.all())):
+            return exact
+        plain = self._plain(fields, noise)
+        length = max(exact.misfit.shape[1], plain.misfit.shape[1])
+        return plain._replace(
+            height=torch.where(noise.even, exact.height, plain.height),
+            misfit=torch.where(
+                noise.even[:, :, 0, 0], _lengthened(exact.misfit, length), _lengthened(plain.misfit, length)
+            ),
+        )
+
+    def _exact(self, fields: Fields, noise: Noise, callback: Callback | None) -> SlopeDLSResult:
+        """By the runs of the recipe, on full rectangles with equal trust."""
+        v, w = self.edges(fields)
+        start = solve(edge_slopes(fields.gradient)[0], pixel_size=fields.steps).height
+        misfit = [edge_cost(start, v, w, fields.steps)]
+
+        def watch(z: Tensor) -> None:
+            misfit.append(edge_cost(z, v, w, fields.steps))
+            if callback is not None:
+                callback(len(misfit) - 1, misfit[-1].detach())
+
+        guarded = self.guard is not None
+        height = smooth(self._runs(), fields.gradient, noise.overall, fields.steps, guarded, watch)
+        return SlopeDLSResult(height, None, None, torch.stack(misfit, 1), noise.level, height)
+
+    def _plain(self, fields: Fields, noise: Noise, callback: Callback | None = None) -> SlopeDLSResult:
+        recipe = replace(_PLAIN[self.recipe], **self._given())
         a = GradientOperator("forward", fields.steps)
         v, w = self.edges(fields)
         z = start = self._height(fields, v, w, None)
         valid, coded = _continue(fields, z, w, self.z_tol)
-        scales = self._scales(fields)
-        D = scales[0].initial_dictionary(v) if self.learn else None
+        scales = _scales(fields, recipe.patch_sizes)
+        D = scales[0].initial_dictionary(v) if recipe.learn else None
         B: Tensor | None = None
         misfit = [edge_cost(z, v, w, fields.steps)]
-        for iteration in range(self.n_iter):
+        for iteration in range(recipe.n_iter):
             slopes = extend_edges(a(z))
             slopes = slopes if valid is None else torch.where(valid, slopes, coded)
             parts = []
             for k, scale in enumerate(scales):
                 if k == 0 and D is not None:  # on a grid at rest, where the codes of the last iteration still fit
-                    part, D, B = scale.code_atoms(slopes, noise, self.tau, D, B)
+                    part, D, B = scale.code_atoms(slopes, noise, recipe.tau, D, B)
                 else:
-                    part = scale.shifted(iteration).code_cosines(slopes, noise, self.tau, self.aggregate)
+                    part = scale.shifted(iteration).code_cosines(slopes, noise, recipe.tau, recipe.aggregate)
                 parts.append(part)
             coded = average(parts)
             z = self._height(fields, (v + _KAPPA * coded) / (1 + _KAPPA), w, z)
@@ -187,18 +272,13 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         anchor, r = fields.anchor, fields.anchor_weight
         return solve(v, w, anchor, r, tol=self.z_tol, z0=guess, pixel_size=fields.steps).height
 
-    def _scales(self, fields: Fields) -> list[SlopeScale]:
-        """The patches that fit the image; if none does, patches of its own size."""
-        h, w = fields.gradient.shape[-2:]
-        sizes = [(s, s) for s in self.patch_sizes if s <= min(h, w)]
-        least = self.patch_sizes[0]
-        return [SlopeScale(size, fields.steps) for size in sizes or [(min(least, h), min(least, w))]]
-
     def _noise(self, fields: Fields) -> Noise:
         """Level for a trust of 1, and the trust on the edges where it is not the same everywhere."""
         gradient, n = fields.gradient, fields.gradient.shape[0]
         sigma, weight = self.sigma, fields.weight
-        if sigma is None:
+        if sigma is None and min(gradient.shape[2:]) < 2:
+            level = gradient.new_zeros(n)  # without a cell nothing tells it
+        elif sigma is None:
             level = noise_level(gradient, fields.mask, weight, fields.steps)
         else:
             level = torch.as_tensor(sigma, dtype=gradient.dtype, device=gradient.device)
@@ -227,13 +307,14 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         n, step = probe(fields.gradient, noise.overall)
         probed = fields._replace(gradient=fields.gradient + step * n)
         start, moved = (self._height(f, *self.edges(f), None) for f in (fields, fields._replace(gradient=n)))
-        change = (self._run(probed, noise).height - z) / step
+        change = (self._smooth(probed, noise).height - z) / step
         return torch.where(noise.even, sure_guard(z, start, change, moved, noise.overall), z)
 
     def extra_repr(self) -> str:
         """The settings, as `print` shows them."""
-        names = ("patch_sizes", "tau", "n_iter", "learn", "guard", "robust", "aggregate", "pixel_size")
-        return ", ".join(f"{n}={getattr(self, n)!r}" for n in names)
+        given = [f"{name}={value!r}" for name, value in self._given().items()]
+        names = ("recipe", "guard", "robust", "pixel_size")
+        return ", ".join([*given, *(f"{n}={getattr(self, n)!r}" for n in names)])
 
 
 def _continue(fields: Fields, z: Tensor, w: Tensor | None, tol: float) -> tuple[Tensor | None, Tensor]:
@@ -244,3 +325,16 @@ def _continue(fields: Fields, z: Tensor, w: Tensor | None, tol: float) -> tuple[
     if not visible(held) or not bool(held.all()):
         z = harmonic_extension(z, held, tol=tol, pixel_size=fields.steps)
     return extend_edges(w) > 0, extend_edges(GradientOperator("forward", fields.steps)(z))
+
+
+def _scales(fields: Fields, patch_sizes: tuple[int, ...]) -> list[SlopeScale]:
+    """The patches that fit the image; if none does, patches of its own size."""
+    h, w = fields.gradient.shape[-2:]
+    sizes = [(s, s) for s in patch_sizes if s <= min(h, w)]
+    least = patch_sizes[0]
+    return [SlopeScale(size, fields.steps) for size in sizes or [(min(least, h), min(least, w))]]
+
+
+def _lengthened(misfit: Tensor, length: int) -> Tensor:
+    """(N, length): the last value repeats."""
+    return torch.cat([misfit, misfit[:, -1:].expand(-1, length - misfit.shape[1])], 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,12 +11,15 @@ import torch
 from torch import Tensor
 
 from torchdls.integrators.slope_dls.bases import Places
+from torchdls.integrators.slope_dls.blend import sure_weights
 from torchdls.integrators.slope_dls.coding import Coded, average
+from torchdls.integrators.slope_dls.waves import cautious, shrink_slow_waves
 from torchdls.operators import GradientOperator, edge_slopes
 from torchdls.operators.edges import extend_edges
-from torchdls.selection import discrepancy_guard
+from torchdls.selection import discrepancy_guard, probe
 from torchdls.solvers import solve
 
+_PERIODS = (24.0, 32.0)  # pixels: the waves to shrink are longer, after one run and after a blend
 _KAPPA = 25.0  # trust in the coded slopes, as a multiple of that in the measured ones
 
 
@@ -101,15 +104,74 @@ class Run:
         return Coded(places.synthesise(weighted), places.spread(weight))
 
 
-RunOf = Callable[[Tensor, Tensor], Tensor]
-
 FOUR = (
     Run(),
     Run(turned=True),
     Run(sizes=(8, 16, 32, 64), tau=(1.8, 0.3), weights="equal"),
     Run(sizes=(4, 8, 16), whole=False, weights="count", smooth=False),
 )
-QUICK = Run(sizes=(8, 16, 32, 64), tau=(1.8, 0.3), weights="equal")
+QUICK = (Run(sizes=(8, 16, 32, 64), tau=(1.8, 0.3), weights="equal", n_iter=6),)
+
+
+def smooth(
+    runs: Sequence[Run],
+    gradient: Tensor,
+    noise: Tensor,
+    steps: tuple[float, float],
+    guard: bool = True,
+    watch: Callable[[Tensor], None] = lambda z: None,
+) -> Tensor:
+    """The height of one run, or of several blended by SURE; then its slow waves shrunk, and least squares kept in mind.
+
+    Args:
+        runs: one or several.
+        gradient: (N, 2, H, W), full rectangles with equal trust.
+        noise: (N,) standard deviation of one gradient sample.
+        steps: (dx, dy).
+        guard: `discrepancy_guard` in every iteration, and `cautious` at the end.
+        watch: called with the height after each iteration of the first run.
+
+    Returns:
+        (N, 1, H, W); differentiable, with the supports of the codes, the weights of the blend and the choices of the
+        shrinkage held fixed.
+    """
+    start = _least_squares(gradient, steps)
+    heights = []
+    for k, run in enumerate(runs):
+        z = start
+        for following in run.heights(gradient, start, noise, steps, guard):
+            z = following
+            if k == 0:
+                watch(z)
+        heights.append(z)
+    blend = heights[0] if len(runs) == 1 else _blend(runs, torch.stack(heights), start, gradient, noise, steps, guard)
+    period = _PERIODS[len(runs) > 1]
+    height = shrink_slow_waves(blend, start, noise, steps, period)
+    return cautious(height, start, blend, noise, steps) if guard else height
+
+
+def _blend(
+    runs: Sequence[Run],
+    heights: Tensor,
+    start: Tensor,
+    gradient: Tensor,
+    noise: Tensor,
+    steps: tuple[float, float],
+    guard: bool,
+) -> Tensor:
+    """z_ls + sum_m w_m (z_m - z_ls), with the weights from a second round of the runs on probed data."""
+    with torch.no_grad():
+        n, step = probe(gradient.detach(), noise)
+        probed, level = gradient.detach() + step * n, noise.detach()
+        again = _least_squares(probed, steps)
+        moved = [[again, *run.heights(probed, again, level, steps, guard)][-1] for run in runs]
+        changes = (torch.stack(moved) - heights.detach()) / step
+        w = sure_weights(heights.detach(), changes, start.detach(), _least_squares(n, steps), level, steps)
+    return start + (w.mT[:, :, None, None, None] * (heights - start)).sum(0)
+
+
+def _least_squares(gradient: Tensor, steps: tuple[float, float]) -> Tensor:
+    return solve(edge_slopes(gradient)[0], pixel_size=steps).height
 
 
 def _turn(slopes: Tensor) -> Tensor:

@@ -1,0 +1,199 @@
+"""The runs, their blend and the slow waves: against brute force, independent optimisers and simulated noise."""
+
+import pytest
+import torch
+from scipy.optimize import minimize
+
+from tests.helpers import DISK, random_field, seeded
+from torchdls import SURFACES, LeastSquares, SlopeDLS, add_noise, rmse, ssim
+from torchdls.integrators.slope_dls.bases import Places
+from torchdls.integrators.slope_dls.blend import least_in_simplex, sure_weights
+from torchdls.integrators.slope_dls.runs import FOUR, Run, smooth
+from torchdls.integrators.slope_dls.waves import cautious, shrink_slow_waves
+from torchdls.noise import height_noise
+from torchdls.operators import GradientOperator, dct2, idct2
+from torchdls.operators.edges import extend_edges
+from torchdls.surfaces import terrain
+
+STEPS = (0.8, 1.25)
+PLACES = [Places((13, 18), 8, 2), Places((21, 17), 17), Places((21, 18), 16, 3), Places((9, 6), 3), Places((1, 5), 1)]
+
+
+@pytest.mark.parametrize("places", PLACES, ids=str)
+def test_patches_are_orthonormal_and_cover_all(places):
+    x = random_field(2, 2, *places.shape)
+    c = places.analyse(x)
+    patches = places.patchwise(c)
+    rows, columns = places.positions
+    for j, top in enumerate(rows):
+        for i, left in enumerate(columns):
+            patch = x[..., top : top + places.size, left : left + places.size]
+            torch.testing.assert_close(patches[:, :, i, :, j].square().sum((-2, -1)), patch.square().sum((-2, -1)))
+    count = torch.zeros(places.shape, dtype=torch.float64)
+    for top in rows:
+        for left in columns:
+            count[top : top + places.size, left : left + places.size] += 1
+    assert count.min() > 0
+    torch.testing.assert_close(places.synthesise(c), x * count)
+    torch.testing.assert_close(places.spread(torch.ones_like(patches[..., 0, :, 0])), count.expand_as(x))
+
+
+def test_large_patches_hold_a_polynomial_in_few_coefficients():
+    t = torch.linspace(-1, 1, 20, dtype=torch.float64)
+    x = (1 - t[:, None] ** 2 + t**3 * t[:, None])[None, None].expand(1, 2, -1, -1)
+    places = Places((20, 20), 20)
+    assert (
+        places.analyse(x).abs() > 1e-10
+    ).sum() == 2 * 4  # 1, y^2, x y, x^3 y (as Legendre-like products) in each component
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("places", PLACES[:4], ids=str)
+def test_noise_of_every_coefficient_is_exact(places, turned):
+    """Least squares is linear: its answers to all unit gradients tell the variance of everything."""
+    h, w = places.shape
+    g = torch.eye(2 * h * w, dtype=torch.float64).view(-1, 2, h, w)
+    slopes = extend_edges(GradientOperator("forward", STEPS)(LeastSquares(pixel_size=STEPS)(g)))
+    if turned:
+        p, q = slopes.split(1, 1)
+        slopes = torch.cat([p + q, p - q], 1) / 2**0.5
+    spread = places.analyse(slopes).square().sum(0).sqrt()
+    torch.testing.assert_close(places.noise(g, STEPS, turned), spread, atol=1e-10, rtol=0)
+
+
+@pytest.mark.parametrize("run", [*FOUR, Run(sizes=(3, 5), turned=True)], ids=range(5))
+def test_without_threshold_a_run_codes_everything(run):
+    slopes = random_field(2, 2, 23, 31)
+    coded = run.code(slopes, torch.zeros(2, dtype=torch.float64), STEPS, 3)
+    torch.testing.assert_close(coded, slopes)
+
+
+def test_least_in_simplex_against_an_independent_optimiser():
+    roots, b = random_field(12, 4, 4, seed=1), random_field(12, 4, seed=2)
+    G = roots @ roots.mT
+    found = least_in_simplex(G, b)
+    assert (found >= 0).all()
+    assert (found.sum(1) <= 1 + 1e-6).all()
+
+    def cost(w, k):
+        return 0.5 * w @ G[k].numpy() @ w + b[k].numpy() @ w
+
+    for k in range(12):
+        limits = {"type": "ineq", "fun": lambda w: 1 - w.sum()}
+        best = min(
+            minimize(cost, start, (k,), bounds=[(0, 1)] * 4, constraints=[limits], options={"ftol": 1e-12}).fun
+            for start in ([0.0] * 4, [0.25] * 4)
+        )
+        assert cost(found[k].numpy(), k) < best + 1e-6
+    assert (found > 1e-6).sum(1).unique().numel() > 1  # several kinds of corners were met
+
+
+def test_blend_finds_the_factor_of_a_linear_filter():
+    """With one candidate the weight is near the one that the truth would choose."""
+    surface = SURFACES["peaks"](64, dtype=torch.float64)
+    gradient = add_noise(surface.gradient, 3, seeded(1))
+    sigma = (gradient - surface.gradient).std()[None]
+    k = torch.arange(64, dtype=torch.float64)
+    f = 1 / (1 + ((k[:, None] ** 2 + k**2) / 60) ** 2)
+
+    def smoothed(g):
+        return idct2(f * dct2(LeastSquares()(g)))
+
+    n = torch.where(random_field(1, 2, 64, 64, seed=5) > 0, 1.0, -1.0).double()
+    plain = LeastSquares()(gradient)
+    w = sure_weights(smoothed(gradient)[None], smoothed(n)[None], plain, LeastSquares()(n), sigma, norm=0.5)
+    D, error = dct2(smoothed(gradient) - plain), dct2(plain - surface.height)
+    S = height_noise((64, 64), plain)
+    weight = torch.where(S > 0, S.clamp(min=1e-30).rsqrt(), 0)
+    best = -float((weight * D * error).sum() / (weight * D * D).sum())
+    assert 0.1 < best < 0.9
+    assert abs(float(w) - best) < 0.05
+
+
+def test_slow_waves_against_the_formula_and_beyond_their_band():
+    gradient = random_field(1, 2, 40, 56, seed=3) + 0.3
+    sigma, plain = torch.ones(1, dtype=torch.float64), LeastSquares()(gradient)
+    other = random_field(1, 1, 40, 56, seed=4)
+    before, after = dct2(other)[0, 0], dct2(shrink_slow_waves(other, plain, sigma, period=20.0))[0, 0]
+    basis = dct2(plain)[0, 0]
+    fy, fx = (2 * torch.sin(torch.pi * torch.arange(n).double() / (2 * n)) for n in (40, 56))
+    modes, risks = [], [0.0] * 6
+    for i in range(40):
+        for j in range(56):
+            if 0 < (i / 80) ** 2 + (j / 112) ** 2 < 1 / 400:
+                ly, lx = float(fy[i] ** 2), float(fx[j] ** 2)
+                s2 = (lx * (1 - lx / 4) + ly * (1 - ly / 4)) / (lx + ly)
+                modes.append((i, j, float(basis[i, j]) ** 2 * (lx + ly), s2))
+    for *_, x2, s2 in modes:
+        for k in range(6):
+            t2 = k * k / 4
+            inside = x2 > t2 * s2
+            risks[k] += (t2 * t2 * s2 * s2 / x2 + 2 * s2 * (1 + t2 * s2 / x2) if inside else x2) - s2
+    mean = sum(m[3] for m in modes) / len(modes)
+    share = torch.softmax(-torch.tensor(risks, dtype=torch.float64) / mean / 8, 0)
+    expected = before.clone()
+    for i, j, x2, s2 in modes:
+        expected[i, j] *= sum(float(share[k]) * max(0.0, 1 - k * k / 4 * s2 / x2) for k in range(6))
+    torch.testing.assert_close(after, expected)
+
+
+def test_caution_keeps_least_squares_of_texture_and_the_rest_of_noise():
+    noise = LeastSquares()(random_field(1, 2, 48, 48, seed=1))
+    sigma, flat = torch.ones(1, dtype=torch.float64), torch.zeros_like(noise)
+    torch.testing.assert_close(cautious(flat, noise, flat, sigma), flat)  # all noise was found
+    torch.testing.assert_close(cautious(flat, noise, 0.9 * noise, sigma), noise)  # a hundredth of its energy
+    torch.testing.assert_close(cautious(flat, noise, flat, 0 * sigma), noise)
+
+
+# The whole
+
+
+@pytest.mark.parametrize("recipe, least", [("blend", (1.3, 1.9)), ("quick", (1.15, 1.4))])
+def test_gain_over_least_squares(recipe, least):
+    gains = []
+    for name in ("tent", "peaks", "ridge"):
+        surface = SURFACES[name](64)
+        gradient = torch.cat([add_noise(surface.gradient, 5, seeded(k)) for k in (0, 1)])
+        truth = surface.height.expand(2, -1, -1, -1)
+        plain, found = LeastSquares()(gradient), SlopeDLS(recipe=recipe)(gradient)
+        errors = [(rmse(z, truth).mean(), (1 - ssim(z, truth, surface.data_range)).mean()) for z in (plain, found)]
+        gains.append(torch.tensor([a / b for a, b in zip(*errors, strict=True)]).log())
+    rms, similarity = torch.stack(gains).mean(0).exp().tolist()
+    assert rms > least[0]
+    assert similarity > least[1]
+
+
+def test_terrain_is_left_to_least_squares():
+    surface = terrain(64)
+    gradient = add_noise(surface.gradient, 20, seeded(3))
+    plain, found = LeastSquares()(gradient), SlopeDLS()(gradient)
+    assert rmse(found, surface.height) < 1.005 * rmse(plain, surface.height)
+
+
+def test_a_batch_of_whole_and_holed_surfaces():
+    gradient = add_noise(SURFACES["tent"](32, dtype=torch.float64).gradient, 5, seeded(1)).expand(2, -1, -1, -1)
+    mask = torch.cat([torch.ones(1, 1, 32, 32, dtype=torch.bool), DISK(32, 32)])
+    result = SlopeDLS(n_iter=4, z_tol=1e-10).solve(gradient, mask)
+    torch.testing.assert_close(result.height[:1], SlopeDLS(n_iter=4, z_tol=1e-10)(gradient[:1]))
+    holed = SlopeDLS(n_iter=4, z_tol=1e-10, recipe="plain").solve(gradient[1:], mask[1:])
+    torch.testing.assert_close(result.height[1:], holed.height)
+    torch.testing.assert_close(result.misfit[1:], holed.misfit)
+    assert SlopeDLS().solve(gradient, mask).misfit.shape == (2, 17)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 1)])
+def test_a_single_row_is_integrated_as_it_is(shape):
+    gradient = random_field(2, 2, *shape)
+    torch.testing.assert_close(SlopeDLS()(gradient), LeastSquares()(gradient))
+
+
+def test_derivative_of_the_blend_is_that_of_its_parts():
+    """By finite differences of the same blend with its weights held: scaling data and noise scales the surface."""
+    gradient = add_noise(SURFACES["tent"](24, dtype=torch.float64).gradient, 5, seeded(1))
+    sigma = torch.tensor([0.2], dtype=torch.float64)
+    runs = [Run(n_iter=2), Run(sizes=(4, 8), weights="equal", n_iter=2)]
+    _, slope = torch.autograd.functional.jvp(lambda g: smooth(runs, g, sigma, (1.0, 1.0)), gradient, gradient)
+    step = 1e-6
+    ends = [smooth(runs, gradient * (1 + s), sigma * (1 + s), (1.0, 1.0)) for s in (step, -step)]
+    _, of_noise = torch.autograd.functional.jvp(lambda s: smooth(runs, gradient, s, (1.0, 1.0)), sigma, sigma)
+    torch.testing.assert_close(slope + of_noise, (ends[0] - ends[1]) / (2 * step), atol=1e-6, rtol=1e-5)

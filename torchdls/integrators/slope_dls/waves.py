@@ -1,0 +1,99 @@
+"""What patches cannot see: waves longer than they are; and how far to trust a smoothed height as a whole."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchdls.noise import height_noise
+from torchdls.operators import dct2, idct2
+from torchdls.operators.cosine import neumann_eigenvalues
+
+_THRESHOLDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)
+_TEMPERATURE = 8.0  # of the mean over the thresholds, in units of the noise of one mode: few modes make SURE scatter
+_LEAST_CUT = 0.2  # share of the risk of least squares that must go, as predicted, for anything to be changed
+
+
+def shrink_slow_waves(
+    height: Tensor, reference: Tensor, noise: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0), period: float = 32.0
+) -> Tensor:
+    r"""Shrink the cosine modes of long period by what their least-squares coefficients say of signal and noise.
+
+        C_k -> f_k C_k,   f_k = sum_T p_T max(0, 1 - T^2 s_k^2 / x_k^2),   p_T ~ exp(-R_T / 8)
+        R_T = sum_k (min(x^2, T^4 s^4 / x^2) + 2 s^2 (1 + T^2 s^2 / x^2) [|x| > T s] - s^2) / s^2
+
+    x_k is the coefficient of mode k in the orthonormal basis of the fields that have a surface (L_k^(1/2) dct2(z_ls)_k,
+    L_k the eigenvalue of the Laplacian), s_k its noise; R_T is Stein's unbiased estimate of the risk of threshold T,
+    with s_k^2 in the denominator replaced by its mean. The thresholds 0, 1/2, .. 5/2 are averaged rather than chosen
+    among, since the risk of few modes scatters.
+
+    Args:
+        height: (N, 1, H, W), on a full rectangle.
+        reference: (N, 1, H, W), the least-squares height of the same data, with equal trust in all slopes.
+        noise: (N,) standard deviation of one gradient sample.
+        pixel_size: (dx, dy).
+        period: in pixels; modes of longer period are shrunk.
+
+    Returns:
+        (N, 1, H, W); differentiable, with the p_T held fixed.
+
+    Source: the shrinkage after Karacali, Snyder, IEEE TIP 13(2), 2004; the mean after Leung, Barron, IEEE Trans. IT
+    52(8), 2006.
+    """
+    shape = (height.shape[-2], height.shape[-1])
+    slow = _slow(shape, period, height)
+    eigenvalue = neumann_eigenvalues(shape, height, pixel_size)
+    s2 = noise.square()[:, None, None, None] * height_noise(shape, height, pixel_size) * eigenvalue
+    x2 = dct2(reference).square() * eigenvalue
+    seen = slow & (x2 > 0)
+    ratio = torch.where(seen, s2 / torch.where(seen, x2, 1), 0)
+    risks = torch.stack([_risk(x2.detach(), s2.detach(), ratio.detach(), slow, t) for t in _THRESHOLDS])
+    share = torch.softmax(-risks / _TEMPERATURE, 0)
+    factor = torch.stack([(1 - t * t * ratio).clamp(min=0) for t in _THRESHOLDS])
+    mean = (share[..., None, None, None] * factor).sum(0)
+    return idct2(dct2(height) * torch.where(slow, mean, 1))
+
+
+def cautious(
+    height: Tensor, reference: Tensor, removed_by: Tensor, noise: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)
+) -> Tensor:
+    r"""Return to least squares where hardly any of its noise was found.
+
+        z_ls + r (z - z_ls),   r = clip(5 q - 1, 0, 1),   q = sum |D|^2 S^-1/4 / (sigma^2 sum S^3/4)
+
+    with D = dct2(z' - z_ls), z' the height that found the noise. For a blend by SURE, q is about the share of the risk
+    that it is predicted to remove; where a method keeps most of what least squares says, as on texture, what little it
+    changes is as likely wrong as right.
+
+    Args:
+        height: (N, 1, H, W), on a full rectangle.
+        reference: (N, 1, H, W), the least-squares height.
+        removed_by: (N, 1, H, W), z'.
+        noise: (N,) standard deviation of one gradient sample.
+        pixel_size: (dx, dy).
+
+    Returns:
+        (N, 1, H, W); r is held fixed in derivatives.
+    """
+    variance = height_noise((height.shape[-2], height.shape[-1]), height, pixel_size)
+    weight = torch.where(variance > 0, torch.where(variance > 0, variance, 1).pow(-0.25), 0)
+    removed = (weight * dct2((removed_by - reference).detach()).square()).sum((-3, -2, -1))
+    risk = noise.detach().square() * (weight * variance).sum()
+    share = torch.where(risk > 0, removed / torch.where(risk > 0, risk, 1), 0)
+    return reference + (share / _LEAST_CUT - 1).clamp(0, 1)[:, None, None, None] * (height - reference)
+
+
+def _slow(shape: tuple[int, int], period: float, like: Tensor) -> Tensor:
+    """(H, W) bool: the modes of longer period, without the mean."""
+    rows, columns = (torch.arange(n, dtype=like.dtype, device=like.device) / (2 * n) for n in shape)
+    frequency = (rows.square()[:, None] + columns.square()).sqrt()
+    return (frequency > 0) & (frequency < 1 / period)
+
+
+def _risk(x2: Tensor, s2: Tensor, ratio: Tensor, slow: Tensor, threshold: float) -> Tensor:
+    """(N,) Stein's estimate over the slow modes, in units of their mean noise."""
+    t2 = threshold * threshold
+    above = t2 * ratio < 1
+    loss = torch.where(above, t2 * t2 * s2 * ratio, x2) + torch.where(above, 2 * s2 * (1 + t2 * ratio), 0) - s2
+    total = (slow * s2).sum((-3, -2, -1)) / slow.sum().clamp(min=1)
+    return (slow * loss).sum((-3, -2, -1)) / torch.where(total > 0, total, 1)
