@@ -7,7 +7,7 @@ from scipy.optimize import minimize
 from tests.helpers import DISK, random_field, seeded
 from torchdls import SURFACES, LeastSquares, SlopeDLS, add_noise, rmse, ssim
 from torchdls.integrators.slope_dls.bases import Places
-from torchdls.integrators.slope_dls.blend import least_in_simplex, sure_weights
+from torchdls.integrators.slope_dls.blend import least_in_simplex, signs, sure_weights
 from torchdls.integrators.slope_dls.runs import FOUR, Run, smooth
 from torchdls.integrators.slope_dls.waves import cautious, shrink_slow_waves
 from torchdls.noise import height_noise
@@ -110,6 +110,15 @@ def test_blend_finds_the_factor_of_a_linear_filter():
     assert abs(float(w) - best) < 0.05
 
 
+def test_signs_are_balanced_and_uncorrelated():
+    n = signs(torch.empty(1, 2, 64, 96, dtype=torch.float64))
+    assert n.unique().tolist() == [-1, 1]
+    count = n.numel() ** 0.5
+    for lag in (0, 1, 2, 96, 97, 64 * 96):
+        product = n.flatten().mean() if lag == 0 else (n.flatten() * n.flatten().roll(lag)).mean()
+        assert abs(float(product)) < 3.5 / count
+
+
 def test_slow_waves_against_the_formula_and_beyond_their_band():
     gradient = random_field(1, 2, 40, 56, seed=3) + 0.3
     sigma, plain = torch.ones(1, dtype=torch.float64), LeastSquares()(gradient)
@@ -197,3 +206,20 @@ def test_derivative_of_the_blend_is_that_of_its_parts():
     ends = [smooth(runs, gradient * (1 + s), sigma * (1 + s), (1.0, 1.0)) for s in (step, -step)]
     _, of_noise = torch.autograd.functional.jvp(lambda s: smooth(runs, gradient, s, (1.0, 1.0)), sigma, sigma)
     torch.testing.assert_close(slope + of_noise, (ends[0] - ends[1]) / (2 * step), atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+def test_blend_under_function_transforms(mapped):
+    draws = [add_noise(SURFACES["tent"](20, dtype=torch.float64).gradient[0], snr, seeded(snr)) for snr in (1, 30)]
+    gradient, method = torch.stack(draws), SlopeDLS(n_iter=2, z_tol=1e-12)
+    mask = None
+    if mapped:
+        mask = torch.ones(2, 1, 20, 20, dtype=torch.bool)
+        mask[1, :, 3:6, 3:6] = False
+    expected = method(gradient, mask)
+    found = torch.vmap(method)(gradient) if mask is None else torch.vmap(method)(gradient, mask)
+    torch.testing.assert_close(found, expected, atol=1e-8, rtol=0)
+    g = gradient.clone().requires_grad_()
+    method(g).square().sum().backward()
+    each = torch.vmap(torch.func.grad(lambda x: method(x).square().sum()))(gradient)
+    torch.testing.assert_close(each, g.grad, atol=1e-8, rtol=1e-8)

@@ -9,6 +9,21 @@ from torch import Tensor
 
 from torchdls.noise import height_noise
 from torchdls.operators import dct2
+from torchdls.operators.tables import table
+
+
+def signs(like: Tensor) -> Tensor:
+    """(1, 2, H, W) random signs, the same at every call: the last bits of SplitMix64, which vmap and compilers bear."""
+    found: Tensor = _signs(*like.shape[-2:], like=like)
+    return found
+
+
+@table
+def _signs(h: int, w: int) -> Tensor:
+    k = (torch.arange(2 * h * w, device="cpu") + 1) * -0x61C8864680B583EB  # wraps around at 2^64
+    k = (k ^ (k >> 30 & (1 << 34) - 1)) * -0x40A7B892E31B1A47
+    k = (k ^ (k >> 27 & (1 << 37) - 1)) * -0x6B2FB644ECCEEE15
+    return ((k ^ k >> 31) & 1).double().mul(2).sub(1).view(1, 2, h, w)
 
 
 def sure_weights(

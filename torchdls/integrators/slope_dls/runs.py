@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from torchdls.integrators.slope_dls.bases import Places
-from torchdls.integrators.slope_dls.blend import sure_weights
+from torchdls.integrators.slope_dls.blend import signs, sure_weights
 from torchdls.integrators.slope_dls.coding import Coded, average
 from torchdls.integrators.slope_dls.waves import cautious, shrink_slow_waves
 from torchdls.operators import GradientOperator, edge_slopes
 from torchdls.operators.edges import extend_edges
-from torchdls.selection import discrepancy_guard, probe
+from torchdls.selection import discrepancy_guard
 from torchdls.solvers import solve
 
 _PERIODS = (24.0, 32.0)  # pixels: the waves to shrink are longer, after one run and after a blend
@@ -161,8 +161,10 @@ def _blend(
 ) -> Tensor:
     """z_ls + sum_m w_m (z_m - z_ls), with the weights from a second round of the runs on probed data."""
     with torch.no_grad():
-        n, step = probe(gradient.detach(), noise)
-        probed, level = gradient.detach() + step * n, noise.detach()
+        n, level = signs(gradient).expand_as(gradient), noise.detach()
+        step = 0.1 * level[:, None, None, None]
+        step = torch.where(step > 0, step, 1)
+        probed = gradient.detach() + step * n
         again = _least_squares(probed, steps)
         moved = [[again, *run.heights(probed, again, level, steps, guard)][-1] for run in runs]
         changes = (torch.stack(moved) - heights.detach()) / step
