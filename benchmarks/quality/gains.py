@@ -84,8 +84,9 @@ def methods(full: bool, n: int) -> dict[str, list[Method]]:
 
     chosen: dict[str, list[Method]] = {"SlopeDLS": [SlopeDLS()], "SlopeDLS.fast": [SlopeDLS.fast()]}
     if full:
-        chosen["SlopeDLS, learn=False"] = [SlopeDLS(learn=False)]
-        chosen["SlopeDLS, guard='sure'"] = [SlopeDLS(guard="sure")]
+        chosen["SlopeDLS, plain"] = [SlopeDLS(recipe="plain")]
+        chosen["SlopeDLS, plain, learn=False"] = [SlopeDLS(recipe="plain", learn=False)]
+        chosen["SlopeDLS, plain, guard='sure'"] = [SlopeDLS(recipe="plain", guard="sure")]
         chosen["second-order TV, best of 4"] = [lambda g, w=w: second_order_tv(g, w) for w in WEIGHTS]
         chosen["DLS"] = [DLS(n_iter=15, tol=0)]
         chosen["DLS, best of 3"] = [dls(mu) for mu in THRESHOLDS]
