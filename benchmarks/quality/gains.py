@@ -173,7 +173,7 @@ def surface_table(rows: list[dict[str, Any]], method: str = "SlopeDLS") -> str:
     snrs = sorted({r["snr"] for r in rows})
     found = {(r["surface"], r["snr"]): r for r in rows if r["method"] == method}
     lines = [
-        [name, *(f"{found[name, s]['rmse']:.2f} / {found[name, s]['1-ssim']:.2f}" for s in snrs)]
+        [name, *(" / ".join(f"{found[name, s][m] or math.nan:.2f}" for m in MEASURES[:2]) for s in snrs)]
         for name in dict.fromkeys(r["surface"] for r in rows)
     ]
     return markdown_table([f"gain of {method}", *(f"{s} dB" for s in snrs)], lines)
