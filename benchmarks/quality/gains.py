@@ -84,8 +84,9 @@ def methods(full: bool, n: int) -> dict[str, list[Method]]:
 
     chosen: dict[str, list[Method]] = {"SlopeDLS": [SlopeDLS()], "SlopeDLS.fast": [SlopeDLS.fast()]}
     if full:
-        chosen["SlopeDLS, learn=False"] = [SlopeDLS(learn=False)]
-        chosen["SlopeDLS, guard='sure'"] = [SlopeDLS(guard="sure")]
+        chosen["SlopeDLS, plain"] = [SlopeDLS(recipe="plain")]
+        chosen["SlopeDLS, plain, learn=False"] = [SlopeDLS(recipe="plain", learn=False)]
+        chosen["SlopeDLS, plain, guard='sure'"] = [SlopeDLS(recipe="plain", guard="sure")]
         chosen["second-order TV, best of 4"] = [lambda g, w=w: second_order_tv(g, w) for w in WEIGHTS]
         chosen["DLS"] = [DLS(n_iter=15, tol=0)]
         chosen["DLS, best of 3"] = [dls(mu) for mu in THRESHOLDS]
@@ -172,7 +173,7 @@ def surface_table(rows: list[dict[str, Any]], method: str = "SlopeDLS") -> str:
     snrs = sorted({r["snr"] for r in rows})
     found = {(r["surface"], r["snr"]): r for r in rows if r["method"] == method}
     lines = [
-        [name, *(f"{found[name, s]['rmse']:.2f} / {found[name, s]['1-ssim']:.2f}" for s in snrs)]
+        [name, *(" / ".join(f"{found[name, s][m] or math.nan:.2f}" for m in MEASURES[:2]) for s in snrs)]
         for name in dict.fromkeys(r["surface"] for r in rows)
     ]
     return markdown_table([f"gain of {method}", *(f"{s} dB" for s in snrs)], lines)

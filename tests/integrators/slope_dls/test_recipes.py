@@ -61,6 +61,32 @@ def test_noise_of_every_coefficient_is_exact(places, turned):
     torch.testing.assert_close(places.noise(g, STEPS, turned), spread, atol=1e-10, rtol=0)
 
 
+@pytest.mark.parametrize("size", [8, 64])
+def test_in_large_images_patches_in_the_middle_share_their_noise(size):
+    """Against the influence of every sample on one coefficient, by reverse differentiation of least squares."""
+    places = Places((64, 330), size, 2)
+    noise = places.patchwise(places.noise(torch.empty(0, dtype=torch.float64), STEPS))
+    for i in (0, 1, len(places.positions[1]) // 2, len(places.positions[1]) - 1):
+        g = torch.zeros(1, 2, 64, 330, dtype=torch.float64)
+        row, column = places.positions[0][0], places.positions[1][i]
+        atom = places.synthesise(_one(places, i, 1, 0))  # (1, 2, H, W): atom (0, 1) of a patch in the slopes in x
+        assert atom[..., row : row + size, column : column + size].square().sum() > 0.99
+        a = GradientOperator("forward", STEPS)
+        with torch.enable_grad():
+            g.requires_grad_()
+            seen = (extend_edges(a(LeastSquares(pixel_size=STEPS)(g)))[:, :1] * atom[:, :1]).sum()
+            (influence,) = torch.autograd.grad(seen, g)  # linear: the variance is the energy of this
+        assert abs(float(noise[0, i, 1, 0, 0] / influence.norm()) - 1) < 0.03
+
+
+def _one(places, column, k, row):
+    """Coefficients that are 0 but for atom (0, k) of one patch of the first component."""
+    side = [len(p) * places.size for p in places.positions]
+    c = torch.zeros(1, 2, side[1], side[0], dtype=torch.float64)
+    places.patchwise(c)[0, 0, column, k, row, 0] = 1
+    return c
+
+
 @pytest.mark.parametrize("run", [*FOUR, Run(sizes=(3, 5), turned=True)], ids=range(5))
 def test_without_threshold_a_run_codes_everything(run):
     slopes = random_field(2, 2, 23, 31)

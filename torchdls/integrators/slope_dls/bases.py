@@ -15,6 +15,7 @@ from torchdls.operators.tables import table
 _GOLDEN = 0.381966  # of a stride: the shifts of the patch grid from one iteration to the next, never in step
 _SMOOTH_FROM = 16  # pixels: smaller patches have too few atoms to spend six on polynomials
 _DEGREE = 5
+_EXACT = 192  # pixels: along longer sides the patches in the middle share their noise
 
 
 @dataclass(frozen=True)
@@ -84,10 +85,13 @@ class Places:
         Returns:
             (2, W', H').
         """
-        small = self.shape[0] * self.shape[1] <= _CACHED
-        find = _noise if small else _noise_uncached
-        found: Tensor = find(self.shape, self.size, self.offset, self.smooth, tuple(steps), turned, like=like)
-        return found
+        (h, rows), (w, columns) = (_less(n, self.size, self.offset) for n in self.shape)
+        found: Tensor = _noise((h, w), self.size, self.offset, self.smooth, tuple(steps), turned, like=like)
+        if (h, w) == self.shape:
+            return found
+        by_patch = found.unflatten(-1, (-1, self.size)).unflatten(-3, (-1, self.size))
+        down, across = (torch.tensor(k, device=like.device) for k in (rows, columns))
+        return by_patch.index_select(1, across).index_select(3, down).flatten(1, 2).flatten(2)
 
     def _forward(self, x: Tensor, positions: tuple[int, ...]) -> Tensor:
         index, atoms = _samples(self.size, positions, like=x), _atoms(self.size, self.smooth, like=x)
@@ -106,6 +110,16 @@ def _positions(n: int, size: int, offset: int) -> tuple[int, ...]:
     stride = max(1, size // 2)
     steps = range(-(-(n - size + offset) // stride) + 1)
     return tuple(sorted({min(max(0, k * stride - offset), n - size) for k in steps}))
+
+
+def _less(n: int, size: int, offset: int) -> tuple[int, list[int]]:
+    """A side that is shorter by whole strides, and the patch of it that stands for each patch of the whole side."""
+    stride = max(1, size // 2)
+    left_out = max(0, n - max(_EXACT, 4 * size)) // stride
+    less = n - left_out * stride
+    count = len(_positions(less, size, offset))
+    half = count // 2
+    return less, [*range(half), *[half] * left_out, *range(half, count)]
 
 
 @table
@@ -173,7 +187,5 @@ def _seen(n: int, size: int, offset: int, smooth: bool, double: Tensor) -> tuple
     return value, slope
 
 
-_CACHED = 256 * 256  # pixels: the tables of larger images are made anew each time rather than kept
 _owners = table(_owners_build)
 _noise = table(_build_noise, maxsize=160)
-_noise_uncached = table(_build_noise, maxsize=0)
