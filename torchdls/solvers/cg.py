@@ -57,6 +57,7 @@ def conjugate_gradients(
     else:  # where b = 0 the solution is 0, which no iteration from elsewhere would meet
         x = torch.where(norm.view(-1, *[1] * (b.ndim - 1)) > 0, x0, 0)
         r = b - apply(x)
+        r = r if project is None else project(r)  # a guess outside the range of H brings a residual that is too
     active = _norm(r) > goal
     iterations = torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
     p, rho = torch.zeros_like(b), torch.ones_like(goal)

@@ -213,6 +213,7 @@ def _iterate(b: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, s
     The factor costs as much as `_PATIENCE` steps (measured from 128^2 to 512^2), so at worst half of the work is lost.
     """
     b = gauge.remove(gauge.remove(b))  # again: a mean left by rounding lies outside the range of H
+    z0 = None if z0 is None else gauge.remove(z0)  # what it says of free constants is not for CG to mend
     patience = _PATIENCE if b[0].numel() * b.shape[0] <= _LARGEST else setting.max_iter
     found = conjugate_gradients(
         _normal(w, r, setting), preconditioner(w, r, setting.pixel_size), b, z0,

@@ -389,3 +389,16 @@ def test_callback_reports_every_iteration():
     result = L1(n_iter=4, tol=0).solve(random_field(2, 2, 6, 6), callback=lambda i, f: seen.append((i, f)))
     assert [i for i, _ in seen] == [1, 2, 3, 4]
     torch.testing.assert_close(torch.stack([f for _, f in seen], 1), result.objective[:, 1:])
+
+
+@pytest.mark.parametrize("make", [L1, TotalVariation, Huber])
+def test_two_parts_in_single_precision(make):
+    """A warm start outside the range of a singular system must not be taken for progress."""
+    y, x = torch.meshgrid(torch.arange(96.0) - 48, torch.arange(96.0) - 40, indexing="ij")
+    z = (0.01 * x.square() - 0.02 * y.square() + 0.3 * x)[None, None]
+    mask = torch.ones(1, 1, 96, 96, dtype=torch.bool)
+    mask[..., 48] = False
+    height = make()(torch.stack([0.02 * x + 0.3, -0.04 * y])[None], mask=mask)
+    for part in (slice(0, 48), slice(49, 96)):
+        truth = z[..., part] - z[..., part].mean()
+        assert float((height[..., part] - truth).abs().max()) < 0.02 * float(truth.abs().max())
