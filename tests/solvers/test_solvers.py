@@ -331,3 +331,59 @@ def test_weights_that_jump_by_many_orders_are_solved_exactly(generator):
     assert bool(found.converged.all())
     assert 60 < int(found.iterations) <= 63  # the patience, and at most three steps with the factor
     assert_solves(found.height, v, w, atol=1e-6)
+
+
+def relief(n=64):
+    """A quadratic far from 0, and its exact slopes at the pixels."""
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64),) * 2, indexing="ij")
+    z = 0.01 * (x - 32).square() - 0.02 * (y - 64 / 3).square() + 0.3 * x + 500
+    return z, torch.stack([0.02 * (x - 32) + 0.3, -0.04 * (y - 64 / 3)])[None]
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+@pytest.mark.parametrize("weight", [1e-9, 1e-5, 1.0, 1e4, 1e6, 1e12])
+def test_anchors_of_any_weight_and_offset_do_not_swallow_the_tolerance(weight, offset):
+    z, g = relief()
+    r = torch.zeros(1, 1, 64, 64, dtype=torch.float64)
+    r[..., 0] = weight
+    found = solve(edge_slopes(g)[0], None, (z + offset)[None, None], r)
+    assert bool(found.converged.all())
+    assert float((found.height - offset - z).abs().max()) < 1e-5 * float(z.max() - z.min())
+
+
+@pytest.mark.parametrize("weight", [1e-3, 1.0, 1e4, 1e12])
+def test_firm_anchors_in_single_precision(weight):
+    z, g = relief()
+    r = torch.zeros(1, 1, 64, 64)
+    r[..., 0] = weight
+    found = solve(edge_slopes(g)[0].float(), None, (z - 500)[None, None].float(), r)
+    assert float((found.height.double() + 500 - z).abs().max()) < 1e-5 * float(z.max() - z.min())
+
+
+def test_one_weak_anchor_fixes_the_constant(generator):
+    v = edge_slopes(torch.randn(1, 2, 40, 40, generator=generator, dtype=torch.float64))[0]
+    r = torch.zeros(1, 1, 40, 40, dtype=torch.float64)
+    r[0, 0, 7, 9] = 1e-5
+    found = solve(v, None, torch.ones_like(r), r)
+    expected = sparse_solve(v[0], None, torch.ones(40, 40, dtype=torch.float64), r[0])
+    np.testing.assert_allclose(found.height[0, 0], expected, atol=1e-5 * np.ptp(expected))
+    assert abs(float(found.height[0, 0, 7, 9]) - 1) < 1e-5
+
+
+def test_the_derivative_in_a_firm_anchor_far_from_zero(generator):
+    z, g = relief(12)
+    r = torch.zeros(1, 1, 12, 12, dtype=torch.float64)
+    r[..., 0] = 1e6
+    probe = torch.randn(1, 1, 12, 12, generator=generator, dtype=torch.float64)
+    v = edge_slopes(g)[0]
+
+    def height(anchor, v):
+        return (solve(v, None, anchor, r).height * probe).sum()
+
+    anchor = (z + 1e3)[None, None]
+    slopes = torch.autograd.functional.jacobian(height, (anchor, v))
+    for i, direction in enumerate((torch.randn_like(anchor), torch.randn_like(v))):
+        up, down = ([anchor, v], [anchor, v])
+        up[i], down[i] = up[i] + direction, down[i] - direction
+        expected = (height(*up) - height(*down)) / 2  # linear in both
+        torch.testing.assert_close((slopes[i] * direction).sum(), expected, rtol=1e-4, atol=1e-4)

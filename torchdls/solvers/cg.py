@@ -34,6 +34,7 @@ def conjugate_gradients(
     tol: float,
     max_iter: int,
     project: LinearMap | None = None,
+    scale: Tensor | None = None,
 ) -> CGResult:
     """Solve H x = b for every system of the batch.
 
@@ -43,15 +44,17 @@ def conjugate_gradients(
         precondition: an approximate inverse, symmetric positive definite on that range.
         b: (N, ...) right-hand sides.
         x0: (N, ...) warm start, or None for 0.
-        tol: a system stops once ||r|| <= tol ||b||, with r the residual of the recursion (free of rounding in x).
+        tol: a system stops once ||r|| <= tol scale, with r the residual of the recursion (free of rounding in x).
         max_iter: limit of iterations.
         project: orthogonal projection on the range of a singular H. Rounding leaves it, and a preconditioner that does
             not commute with it would take what is outside for progress. It may overwrite its argument.
+        scale: (N,) what residuals are measured by; None for ||b||.
 
     A system that has stopped is frozen: its result does not depend on its neighbours in the batch.
     """
     norm = _norm(b)
-    goal = tol * norm
+    scale = norm if scale is None else scale
+    goal = tol * scale
     if x0 is None:
         x, r = torch.zeros_like(b), b.clone()
     else:  # where b = 0 the solution is 0, which no iteration from elsewhere would meet
@@ -75,7 +78,7 @@ def conjugate_gradients(
         rho = rho_new
         iterations += active
         active = active & (_norm(r) > goal)
-    residual = _norm(r) / torch.where(norm > 0, norm, 1)
+    residual = _norm(r) / torch.where(scale > 0, scale, 1)
     return CGResult(x, iterations, residual, ~active)
 
 

@@ -214,18 +214,64 @@ def _iterate(b: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, s
     """
     b = gauge.remove(gauge.remove(b))  # again: a mean left by rounding lies outside the range of H
     z0 = None if z0 is None else gauge.remove(z0)  # what it says of free constants is not for CG to mend
+    anchors = _Anchors.of(w, r, gauge, setting)
+    scale = None
+    if anchors is not None:
+        start = anchors.start(b)
+        scale = (b - anchors.apply(start)).flatten(1).norm(dim=1)
+        z0 = start if z0 is None else anchors.shift(z0, b)
     patience = _PATIENCE if b[0].numel() * b.shape[0] <= _LARGEST else setting.max_iter
     found = conjugate_gradients(
         _normal(w, r, setting), preconditioner(w, r, setting.pixel_size), b, z0,
-        tol=setting.tol, max_iter=min(patience, setting.max_iter), project=gauge.correction(),
+        tol=setting.tol, max_iter=min(patience, setting.max_iter), project=gauge.correction(), scale=scale,
     )  # fmt: skip
-    if bool(found.converged.all()) or patience >= setting.max_iter:
-        return found
-    rest = (~found.converged).nonzero()[:, 0]
-    return found.replace(rest, _directly(b[rest], w[rest], r[rest], found.x[rest], gauge.select(rest), setting))
+    if not bool(found.converged.all()) and patience < setting.max_iter:
+        rest = (~found.converged).nonzero()[:, 0]
+        scale = None if scale is None else scale[rest].double()
+        direct = _directly(b[rest], w[rest], r[rest], found.x[rest], gauge.select(rest), setting, scale)
+        found = found.replace(rest, direct)
+    return found if anchors is None else found._replace(x=anchors.shift(found.x, b))
 
 
-def _directly(b: Tensor, w: Tensor, r: Tensor, x: Tensor, gauge: Gauge, setting: _Setting) -> CGResult:
+class _Anchors(NamedTuple):
+    r"""What anchors on some of the pixels demand of a solve: firm or far from 0, they drown the residuals of the rest.
+
+    So residuals are measured against those of a start that the anchors alone suggest, and the constant c of every
+    component that they hold is found from the sum of its equations, \sum_i r_i (z_i + c) = \sum_i b_i.
+    """
+
+    labels: Tensor
+    r: Tensor
+    diagonal: Tensor
+    apply: LinearMap
+
+    @classmethod
+    def of(cls, w: Tensor, r: Tensor, gauge: Gauge, setting: _Setting) -> _Anchors | None:
+        """None without anchors, or where they are on every pixel and so leave nothing to swallow."""
+        scale = torch.tensor(setting.pixel_size, dtype=w.dtype, device=w.device).view(1, 2, 1, 1)
+        edges = edge_ends(w / scale.square())
+        some = gauge.labels.shape[1] > 0 and bool((r > 0).any())
+        if not some or bool(((r > 0) | (edges == 0)).all()):
+            return None
+        return cls(gauge.labels, r, edges + r, _normal(w, r, setting))
+
+    def shift(self, z: Tensor, b: Tensor) -> Tensor:
+        """The height with the constants that its equations ask for."""
+        rest, trust = ((t.double().flatten(1)) for t in (b - self.apply(z), self.r))
+        sums, weights = (torch.zeros_like(t).scatter_add(1, self.labels, t) for t in (rest, trust))
+        c = torch.where(weights > 0, sums / torch.where(weights > 0, weights, 1), 0)
+        return z + c.gather(1, self.labels).view_as(z).to(z.dtype)
+
+    def start(self, b: Tensor) -> Tensor:
+        """The constants of the anchors, and firm anchors where they want to be."""
+        z = self.shift(torch.zeros_like(b), b)
+        firm = 2 * self.r > self.diagonal
+        return z + torch.where(firm, (b - self.apply(z)) / torch.where(firm, self.diagonal, 1), 0)
+
+
+def _directly(
+    b: Tensor, w: Tensor, r: Tensor, x: Tensor, gauge: Gauge, setting: _Setting, norm: Tensor | None
+) -> CGResult:
     """The same, preconditioned by a direct factor and in double precision; one step mostly, three where H is singular.
 
     In the factor alone, one pixel of every free component is held by as much as its edges weigh.
@@ -237,7 +283,7 @@ def _directly(b: Tensor, w: Tensor, r: Tensor, x: Tensor, gauge: Gauge, setting:
     direct = factor(w, held, setting.pixel_size)
     found = conjugate_gradients(
         _normal(w, r, setting), lambda y: gauge.remove(direct.solve(y)), gauge.remove(b), x,
-        tol=setting.tol, max_iter=_DIRECT_STEPS, project=gauge.correction(),
+        tol=setting.tol, max_iter=_DIRECT_STEPS, project=gauge.correction(), scale=norm,
     )  # fmt: skip
     return found._replace(x=found.x.to(dtype), residual=found.residual.to(dtype))
 
