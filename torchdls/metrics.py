@@ -39,6 +39,13 @@ def rmse(height: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tenso
     Raises:
         ValueError: the shapes differ, or a mask is empty.
         TypeError: a field is not floating point, or `mask` is not bool.
+
+    Example:
+        >>> reference = torch.tensor([[[0.0, 1.0]]])
+        >>> torchdls.rmse(reference + 5, reference)  # the constant is free
+        tensor(0.)
+        >>> torchdls.rmse(3 * reference, reference)
+        tensor(1.)
     """
     height, reference, mask = _fields("rmse", height, reference, mask)
     difference = torch.where(mask, height - reference, 0)
@@ -72,6 +79,11 @@ def ssim(height: Tensor, reference: Tensor, data_range: float, mask: Tensor | No
         TypeError: a field is not floating point, or `mask` is not bool.
 
     Source: Wang, Bovik, Sheikh, Simoncelli, IEEE TIP 13(4), 2004.
+
+    Example:
+        >>> surface = torchdls.SURFACES["tent"](32)
+        >>> torchdls.ssim(surface.height, surface.height, surface.data_range)
+        tensor([1.])
     """
     if not 0 < data_range < float("inf"):
         raise ValueError(f"ssim: data_range {data_range} given, a positive number is needed")
@@ -121,6 +133,11 @@ def mean_angular_error(
     Raises:
         ValueError: the shapes do not fit, no cell lies inside the mask, or a pixel size is not positive.
         TypeError: a field is not floating point, or `mask` is not bool.
+
+    Example:
+        >>> surface = torchdls.SURFACES["tent"](32)
+        >>> torchdls.mean_angular_error(0 * surface.height, torch.ones(1, 2, 32, 32) / 2**0.5)
+        tensor([45.])
     """
     given = reference
     height, reference, mask = _fields("mean_angular_error", height, reference, mask, channels=(1, 2))
@@ -155,6 +172,11 @@ def mean_absolute_depth_error(depth: Tensor, reference: Tensor, mask: Tensor | N
         TypeError: a field is not floating point, or `mask` is not bool.
 
     Source: Cao, Santo, Shi, Okura, Matsushita, "Bilateral normal integration", ECCV 2022.
+
+    Example:
+        >>> depth = torch.tensor([[[1.0, 2.0, 3.5]]])
+        >>> torchdls.mean_absolute_depth_error(depth, torch.tensor([[[2.0, 4.0, 6.0]]]))
+        tensor(0.3333)
     """
     depth, reference, mask = _fields("mean_absolute_depth_error", depth, reference, mask)
     depth, reference = torch.where(mask, depth, 1), torch.where(mask, reference, 0)

@@ -73,6 +73,12 @@ def noise_level(
         ValueError: shapes do not fit, the gradient is not finite inside the mask, a weight is negative or not
             finite, no complete cell lies inside a mask, or a pixel size is not positive.
         TypeError: the gradient is not float32 or float64, or the mask is not bool.
+
+    Example:
+        >>> gradient = torchdls.SURFACES["peaks"](96).gradient
+        >>> noisy = gradient + 0.1 * torch.randn(gradient.shape, generator=torch.Generator().manual_seed(0))
+        >>> round(float(torchdls.noise_level(noisy)), 2)
+        0.1
     """
     dx, dy = as_pixel_size(pixel_size)
     single = gradient.ndim == 3
@@ -305,6 +311,10 @@ def noise_sigma(gradient: Tensor, snr_db: float, mask: Tensor | None = None) -> 
 
     Raises:
         ValueError: the gradient has no two components, the shapes differ, or `snr_db` is not finite.
+
+    Example:
+        >>> torchdls.noise_sigma(torch.ones(1, 2, 4, 4), snr_db=20)
+        tensor([0.1000])
     """
     if gradient.ndim not in (3, 4) or gradient.shape[-3] != 2:
         raise ValueError(f"gradient: {tuple(gradient.shape)} given, (N, 2, H, W) or (2, H, W) is needed")
@@ -341,6 +351,12 @@ def add_noise(
 
     Raises:
         ValueError: as `noise_sigma`.
+
+    Example:
+        >>> gradient = torch.ones(1, 2, 64, 64)
+        >>> noisy = torchdls.add_noise(gradient, snr_db=20, generator=torch.Generator().manual_seed(0))
+        >>> round(float((noisy - gradient).std()), 2)
+        0.1
     """
     sigma = noise_sigma(gradient, snr_db, mask)
     source = "cpu" if generator is None else generator.device

@@ -41,7 +41,7 @@ def build(name: str, /, **options: Any) -> Integrator:
             mark of a tensor, which holds no values.
 
     Example:
-        >>> build("dls", learner={"name": "k_svd", "n_nonzero": 4}, n_iter=10)
+        >>> torchdls.build("dls", learner={"name": "k_svd", "n_nonzero": 4}, n_iter=10)
         DLS(n_iter=10, learner=KSVD(n_nonzero=4, steps=1))
     """
     return _make_integrator(name, options, None)
@@ -61,6 +61,15 @@ def save(path: str | os.PathLike[str], integrator: Integrator, *, overwrite: boo
         FileNotFoundError: the directory does not exist.
         FileExistsError: the file exists and `overwrite` is False.
         ImportError: safetensors is not installed.
+
+    Example:
+        >>> import tempfile
+        >>> trained = torchdls.DLS(n_iter=2, lam=torch.nn.Parameter(torch.tensor(0.25)))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     torchdls.save(f"{folder}/dls.safetensors", trained)
+        ...     torchdls.load(f"{folder}/dls.safetensors").lam
+        Parameter containing:
+        tensor(0.2500, requires_grad=True)
     """
     path = check_output(path, overwrite, suffixes=[_SUFFIX])
     name = INTEGRATORS.name_of(type(integrator))
@@ -82,6 +91,13 @@ def load(path: str | os.PathLike[str]) -> Integrator:
             unknown, or its tensors are not those of the integrator. The message names the file.
         FileNotFoundError: there is no such file.
         ImportError: safetensors is not installed.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     torchdls.save(f"{folder}/dls.safetensors", torchdls.DLS(n_iter=10))
+        ...     torchdls.load(f"{folder}/dls.safetensors")
+        DLS(n_iter=10)
     """
     path = Path(path)
     metadata, tensors = _read(path)

@@ -44,6 +44,11 @@ def hillshade(
         pixel_size: (dx, dy), in the unit of the height.
         azimuth: degrees clockwise from the top of the image; 315 is the upper left.
         altitude: degrees above the image plane.
+
+    Example:
+        >>> shade = torchdls.hillshade(torch.zeros(4, 5), altitude=30)  # flat: the sine of the altitude everywhere
+        >>> shade.shape, round(float(shade[0, 0]), 2)
+        (torch.Size([4, 5]), 0.5)
     """
     if height.ndim < 2 or min(height.shape[-2:]) < 2:
         raise ValueError(f"height: shape {tuple(height.shape)} given, (..., H, W) of at least 2 x 2 pixels is needed")
@@ -86,6 +91,13 @@ def compare_heights(
     Raises:
         ValueError: there is no height, or the shapes differ.
         ImportError: matplotlib is missing.
+
+    Example:
+        >>> surface = torchdls.SURFACES["tent"](32)
+        >>> heights = {"least squares": torchdls.LeastSquares()(surface.gradient)}
+        >>> figure = torchdls.compare_heights(surface.height, heights, measured=surface.gradient)
+        >>> type(figure).__name__
+        'Figure'
     """
     require("matplotlib", "plots")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -149,6 +161,11 @@ def surface_page(
     Raises:
         ValueError: there is no height, the shapes differ, or `max_side` is below 2.
         ImportError: plotly is missing.
+
+    Example:
+        >>> page = torchdls.surface_page({"tent": torchdls.SURFACES["tent"](16).height}, title="Tent")
+        >>> page.data[0].type
+        'surface'
     """
     require("plotly", "plots")
     import plotly.graph_objects as go
@@ -184,7 +201,13 @@ def surface_page(
 
 
 def page_html(page: go.Figure) -> str:
-    """The page as one HTML document that fills the window and works offline; the same text for the same figure."""
+    """The page as one HTML document that fills the window and works offline; the same text for the same figure.
+
+    Example:
+        >>> page = torchdls.surface_page({"tent": torchdls.SURFACES["tent"](16).height})
+        >>> torchdls.page_html(page)[:15]
+        '<!doctype html>'
+    """
     html: str = page.to_html(div_id="surface", default_height="100vh", config={"displaylogo": False})
     title = escape(page.layout.title.text or "Surfaces")
     return html.replace("<head>", f"<head><title>{title}</title><style>body {{ margin: 0 }}</style>", 1)

@@ -129,6 +129,13 @@ class Selection(NamedTuple):
         height: (N, 1, H, W), in the unit of the pixel size.
         choice: (N,) number of the candidate, -1 for least squares.
         risk: (M, N) predicted squared error over that of least squares, both in the chosen norm; below 1 is better.
+
+    Example:
+        >>> methods = torchdls.HarkerOLeary(), torchdls.SpectralRegularization(0.25)
+        >>> noise = 0.5 * torch.randn(1, 2, 32, 32, generator=torch.Generator().manual_seed(0))
+        >>> chosen = torchdls.select(lambda g: torch.cat([f(x[None]) for f, x in zip(methods, g)]), noise, candidates=2)
+        >>> int(chosen.choice), chosen.height.shape, chosen.risk.shape
+        (1, torch.Size([1, 1, 32, 32]), torch.Size([2, 1]))
     """
 
     height: Tensor
@@ -178,6 +185,14 @@ def select(
         ValueError: the criterion is unknown, or an argument does not fit.
 
     Source: Stein (1981); Ramani, Blu, Unser (2008); Pang et al., "Recorrupted-to-Recorrupted", CVPR 2021.
+
+    Example:
+        >>> surface = torchdls.SURFACES["peaks"](32)
+        >>> noisy = surface.gradient + 0.5 * torch.randn(1, 2, 32, 32, generator=torch.Generator().manual_seed(0))
+        >>> def integrate(g):  # all of the surfaces by the first candidate, then all by the second
+        ...     return torch.cat([torchdls.LineIntegral()(g[:1]), torchdls.SpectralRegularization(0.25)(g[1:])])
+        >>> int(torchdls.select(integrate, noisy, candidates=2).choice)
+        1
     """
     if criterion not in ("sure", "r2r"):
         raise ValueError(f"select: criterion={criterion!r} is unknown; choose from 'sure', 'r2r'")

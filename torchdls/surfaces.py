@@ -38,6 +38,11 @@ class Surface(NamedTuple):
         data_range: the range for `torchdls.metrics.ssim`, in pixels. A range as large as the surface
             saturates the SSIM near 1, so it is a tenth of the range of the heights, except for `tent` and
             `vase`.
+
+    Example:
+        >>> surface = torchdls.SURFACES["tent"](64)
+        >>> surface.name, surface.height.shape, surface.gradient.shape
+        ('tent', torch.Size([1, 1, 64, 64]), torch.Size([1, 2, 64, 64]))
     """
 
     name: str
@@ -261,6 +266,10 @@ def terrain(
     Raises:
         ImportError: matplotlib is missing; `pip install "torchdls[plots]"` brings it.
         ValueError: `n`, `smoothing` or `dtype` is out of range.
+
+    Example:
+        >>> torchdls.terrain((48, 64)).height.shape
+        torch.Size([1, 1, 48, 64])
     """
     h, w = _check_size(n)
     _check_dtype(dtype)

@@ -33,6 +33,13 @@ def dct_dictionary(
 
     Raises:
         ValueError: a size or the number of atoms is not positive.
+
+    Example:
+        >>> D = torchdls.dct_dictionary(8)
+        >>> D.shape
+        torch.Size([64, 64])
+        >>> torch.allclose(D.T @ D, torch.eye(64), atol=1e-5)
+        True
     """
     sides = (patch_size, patch_size) if isinstance(patch_size, int) else patch_size
     if not isinstance(sides, tuple) or len(sides) != 2 or not all(isinstance(c, int) and c > 0 for c in sides):

@@ -24,7 +24,15 @@ Step = tuple[Tensor, Tensor, Tensor]
 
 
 class Learner(Protocol):
-    """What DLS asks of a learner; see the module."""
+    """What DLS asks of a learner; see the module.
+
+    Example:
+        >>> def no_learner(R, D, B, mu, bound=float("inf"), learn=True):
+        ...     return R, D, B  # codes stay 0
+        >>> dls = torchdls.DLS(n_iter=2, learner=no_learner)
+        >>> dls(torch.zeros(1, 2, 12, 12)).shape
+        torch.Size([1, 1, 12, 12])
+    """
 
     def __call__(
         self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
@@ -42,6 +50,12 @@ class SoupDIL:
         threshold: "hard", "soft" or "firm".
 
     Source: Ravishankar, Nadakuditi, Fessler, "Efficient sum of outer products dictionary learning (SOUP-DIL)", 2015.
+
+    Example:
+        >>> P, D = torch.eye(4)[None], torch.eye(4)[None]
+        >>> R, D, B = torchdls.SoupDIL()(P, D, torch.zeros(1, 4, 4), mu=0.5)
+        >>> B[0].diagonal()
+        tensor([1., 1., 1., 1.])
     """
 
     order: Order = "atom"
@@ -60,6 +74,12 @@ class FixedDictionary:
     """The dictionary stays as it is (the cosine one, by default in DLS); only the codes follow, by thresholding.
 
     Exact for orthonormal dictionaries; for others one pass of coordinate descent over the rows of codes.
+
+    Example:
+        >>> D = torch.eye(4)[None]
+        >>> R, same, B = torchdls.FixedDictionary()(torch.eye(4)[None], D, torch.zeros(1, 4, 4), mu=0.5)
+        >>> torch.equal(same, D), float(R.abs().max())
+        (True, 0.0)
     """
 
     def __call__(
@@ -84,6 +104,12 @@ class DinoKat:
         unused: rule for atoms that no patch uses, "first" or "keep".
 
     Source: Ravishankar, Moore, Nadakuditi, Fessler, "Efficient learning of dictionaries with low-rank atoms", 2016.
+
+    Example:
+        >>> learner = torchdls.DinoKat(rank=1)
+        >>> atom = learner.project(torch.eye(3).reshape(1, 9, 1))
+        >>> int(torch.linalg.matrix_rank(atom.reshape(3, 3)))
+        1
     """
 
     rank: int = 1
@@ -132,6 +158,12 @@ class KSVD:
 
     Source: Aharon, Elad, Bruckstein, "K-SVD: an algorithm for designing overcomplete dictionaries for sparse
     representation", 2006; Rubinstein, Zibulevsky, Elad, 2008.
+
+    Example:
+        >>> P, D = torch.eye(4)[None], torch.eye(4)[None]
+        >>> R, D, B = torchdls.KSVD(n_nonzero=1)(P, D, torch.zeros(1, 4, 4), mu=0.0)
+        >>> (B != 0).sum(-2).tolist()  # one atom each
+        [[1, 1, 1, 1]]
     """
 
     n_nonzero: int | None = None

@@ -29,6 +29,11 @@ def orthogonal_matching_pursuit(
 
     Source: Pati, Rezaiifar, Krishnaprasad, "Orthogonal matching pursuit", 1993; Rubinstein, Zibulevsky, Elad,
     "Efficient implementation of the K-SVD algorithm using batch orthogonal matching pursuit", 2008.
+
+    Example:
+        >>> D = torch.eye(3)[None]
+        >>> torchdls.orthogonal_matching_pursuit(torch.tensor([[[0.1], [2.0], [1.0]]]), D, n_nonzero=1)[0, :, 0]
+        tensor([0., 2., 0.])
     """
     if P.ndim != 3 or D.ndim != 3 or D.shape[0] not in (1, P.shape[0]) or D.shape[1] != P.shape[1]:
         shapes = f"P {tuple(P.shape)} and D {tuple(D.shape)} do not fit"

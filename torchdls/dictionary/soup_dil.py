@@ -70,6 +70,13 @@ def soup_dil_sweep(
         ValueError: shapes do not fit, an option is unknown, the bound is not positive, or a number mu is negative.
 
     Source: Ravishankar, Nadakuditi, Fessler, "Efficient sum of outer products dictionary learning (SOUP-DIL)", 2015.
+
+    Example:
+        >>> P, D = torch.diag(torch.tensor([3.0, 0.2]))[None], torch.eye(2)[None]
+        >>> D, B = torchdls.soup_dil_sweep(P, D, torch.zeros(1, 2, 2), mu=0.5, unused="keep")
+        >>> B  # codes of magnitude below mu are 0
+        tensor([[[3., 0.],
+                 [0., 0.]]])
     """
     _check(P, D, B, order, unused, threshold)
     _check_levels(mu, bound, B)

@@ -25,6 +25,12 @@ class Unitary:
 
     Source: Ravishankar, Bresler, "Closed-form solutions within sparsifying transform learning", ICASSP 2013; the
     orthogonal Procrustes problem: Schoenemann 1966.
+
+    Example:
+        >>> P, D = torch.randn(1, 4, 50, generator=torch.Generator().manual_seed(0)), torch.eye(4)[None]
+        >>> R, D, B = torchdls.Unitary()(P, D, torch.zeros(1, 4, 50), mu=0.5)
+        >>> torch.allclose(D.mT @ D, torch.eye(4), atol=1e-5)
+        True
     """
 
     threshold: Threshold = "hard"

@@ -17,6 +17,11 @@ def log_depth_to_depth(log_depth: Tensor, scale: float | Tensor = 1.0) -> Tensor
 
     An integrator returns u with zero mean, so `scale` is the geometric mean of the depth (of each component of the
     mask), in the unit wanted; a tensor must broadcast against (N, 1, H, W).
+
+    Example:
+        >>> torchdls.log_depth_to_depth(torch.zeros(1, 1, 2, 2), scale=3.0)
+        tensor([[[[3., 3.],
+                  [3., 3.]]]])
     """
     return scale * log_depth.exp()
 
@@ -25,6 +30,11 @@ def depth_to_points(depth: Tensor, camera: Tensor) -> Tensor:
     """Points X = Z K^-1 (column, row, 1) of a depth (N, 1, H, W): (N, 3, H, W), x right, y up, z to the viewer.
 
     TypeError or ValueError for a depth or camera that is not usable, as in `normals_to_gradient`.
+
+    Example:
+        >>> camera = torch.tensor([[8.0, 0, 2], [0, 8, 2], [0, 0, 1]])
+        >>> torchdls.depth_to_points(torch.ones(1, 1, 5, 5), camera)[0, :, 3, 4]
+        tensor([ 0.2500, -0.1250, -1.0000])
     """
     check_field("depth_to_points", "depth", depth, 1)
     points = depth * apply_matrix(inverse_camera(camera, depth), pixel_grid(depth))
@@ -35,6 +45,10 @@ def height_to_points(height: Tensor, pixel_size: float | Sequence[float] = 1.0) 
     """Points (column dx, -row dy, z) of a height (N, 1, H, W): (N, 3, H, W), x right, y up, z to the viewer.
 
     TypeError or ValueError for a height or `pixel_size` that is not usable.
+
+    Example:
+        >>> torchdls.height_to_points(torch.zeros(1, 1, 4, 5), pixel_size=0.5)[0, :, 3, 4]
+        tensor([ 2.0000, -1.5000,  0.0000])
     """
     check_field("height_to_points", "height", height, 1)
     dx, dy = as_pixel_size(pixel_size)

@@ -32,6 +32,10 @@ def convert_normals(normals: Tensor, source: str = "opengl", target: str = "open
     """Express normals (N, 3, H, W) or (3, H, W) of convention `source` in convention `target`.
 
     TypeError for a wrong type, ValueError for a wrong shape or an unknown convention.
+
+    Example:
+        >>> torchdls.convert_normals(torch.tensor([0.0, 0.6, 0.8]).view(3, 1, 1), "opengl", "directx").flatten()
+        tensor([ 0.0000, -0.6000,  0.8000])
     """
     check_field("convert_normals", "normals", normals, 3)
     frame = lookup(NORMAL_CONVENTIONS, "source", source), lookup(NORMAL_CONVENTIONS, "target", target)
@@ -42,6 +46,10 @@ def convert_gradient(gradient: Tensor, source: str = "image", target: str = "ima
     """Express a gradient (N, 2, H, W) or (2, H, W) of convention `source` in convention `target`.
 
     TypeError for a wrong type, ValueError for a wrong shape or an unknown convention.
+
+    Example:
+        >>> torchdls.convert_gradient(torch.tensor([1.0, 2.0]).view(2, 1, 1), source="matlab").flatten()
+        tensor([2., 1.])
     """
     check_field("convert_gradient", "gradient", gradient, 2)
     frame = lookup(GRADIENT_CONVENTIONS, "source", source), lookup(GRADIENT_CONVENTIONS, "target", target)

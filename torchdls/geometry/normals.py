@@ -51,6 +51,11 @@ class GradientField(NamedTuple):
         gradient: (N, 2, H, W); 0 at invalid pixels.
         mask: (N, 1, H, W) bool; True where the pixel lies in the caller's mask and its normal is valid.
         invalid: (N,) number of pixels inside the caller's mask whose normal is invalid.
+
+    Example:
+        >>> field = torchdls.normals_to_gradient(torch.zeros(1, 3, 4, 5))
+        >>> field.gradient.shape, int(field.invalid)
+        (torch.Size([1, 2, 4, 5]), 20)
     """
 
     gradient: Tensor
@@ -104,6 +109,10 @@ def normals_to_gradient(
         TypeError: a tensor has the wrong type.
         ValueError: a shape, the convention, the camera, `pixel_size` or `eps` is not usable, or a camera comes with
             a pixel size.
+
+    Example:
+        >>> torchdls.normals_to_gradient(torch.tensor([-0.6, 0.0, 0.8]).view(1, 3, 1, 1)).gradient.flatten()
+        tensor([0.7500, 0.0000])
     """
     check_field("normals_to_gradient", "normals", normals, 3)
     axes = lookup(NORMAL_CONVENTIONS, "convention", convention)
@@ -153,6 +162,10 @@ def gradient_to_normals(
 
     Returns:
         (N, 3, H, W), of length 1; NaN where the gradient is NaN. Raises as `normals_to_gradient` does.
+
+    Example:
+        >>> torchdls.gradient_to_normals(torch.tensor([0.75, 0.0]).view(1, 2, 1, 1)).flatten()
+        tensor([-0.6000,  0.0000,  0.8000])
     """
     check_field("gradient_to_normals", "gradient", gradient, 2)
     axes = lookup(NORMAL_CONVENTIONS, "convention", convention)
@@ -193,6 +206,11 @@ class NormalsToGradient(_Conversion):
     `nn.Sequential(normal_net, NormalsToGradient(), DLS())` trains through the integration. Invalid pixels get slope 0
     and derivative 0; call `normals_to_gradient` to know which they are. A camera that is an `nn.Parameter` is
     trained, a plain tensor is a buffer.
+
+    Example:
+        >>> model = torch.nn.Sequential(torchdls.NormalsToGradient("directx"), torchdls.LeastSquares())
+        >>> model(torch.ones(1, 3, 8, 8)).shape
+        torch.Size([1, 1, 8, 8])
     """
 
     def __init__(
@@ -220,7 +238,12 @@ class NormalsToGradient(_Conversion):
 
 
 class GradientToNormals(_Conversion):
-    """`gradient_to_normals` as a module: gradient (N, 2, H, W) in, unit normals (N, 3, H, W) out."""
+    """`gradient_to_normals` as a module: gradient (N, 2, H, W) in, unit normals (N, 3, H, W) out.
+
+    Example:
+        >>> torchdls.GradientToNormals("directx")(torch.zeros(1, 2, 4, 5)).shape
+        torch.Size([1, 3, 4, 5])
+    """
 
     def forward(self, gradient: Tensor) -> Tensor:
         """Normals (N, 3, H, W) of a gradient (N, 2, H, W)."""
@@ -259,6 +282,11 @@ def guess_convention(
         camera: intrinsics K, as in `normals_to_gradient`.
 
     Raises as `normals_to_gradient` does, and ValueError if no candidate has a complete 2x2 cell of valid pixels.
+
+    Example:
+        >>> normals = torchdls.gradient_to_normals(torchdls.SURFACES["peaks"](32).gradient, "directx")
+        >>> torchdls.guess_convention(normals).convention
+        'directx'
     """
     curl, scale = {}, 0.0
     for name in candidates:

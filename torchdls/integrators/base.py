@@ -29,6 +29,11 @@ class IntegrationResult(NamedTuple):
         height: (N, 1, H, W).
         iterations: (N,) the iterations each surface took; 0 for direct methods.
         converged: (N,) bool, whether it met the method's tolerance within them.
+
+    Example:
+        >>> result = torchdls.FrankotChellappa().solve(torch.ones(2, 2, 8, 8))
+        >>> result.height.shape, result.iterations.tolist(), result.converged.tolist()
+        (torch.Size([2, 1, 8, 8]), [0, 0], [True, True])
     """
 
     height: Tensor
@@ -48,6 +53,13 @@ class Integrator(nn.Module, ABC):
 
     Args:
         pixel_size: spacing of the columns and the rows (dx, dy), or one number for both; heights come out in its unit.
+
+    Example:
+        >>> class Flat(torchdls.Integrator):  # whatever the slopes are
+        ...     def integrate(self, fields):
+        ...         return torch.zeros_like(fields.gradient[:, :1])
+        >>> Flat()(torch.ones(1, 2, 4, 5)).shape
+        torch.Size([1, 1, 4, 5])
     """
 
     # Which of the optional arguments of `forward` the method honours.

@@ -73,6 +73,15 @@ def load_field(path: str | os.PathLike[str], packing: str | None = None) -> Fiel
         ValueError: the file is damaged, does not hold a normal map or a gradient, or the lengths of its vectors fit no
             packing.
         ImportError: the library for this format is not installed.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     numpy.save(f"{folder}/slopes.npy", numpy.ones((2, 4, 5), dtype="float32"))
+        ...     field = torchdls.load_field(f"{folder}/slopes.npy")
+        >>> field.kind, field.values.shape
+        ('gradient', torch.Size([1, 2, 4, 5]))
     """
     path = Path(path)
     content = read_file(path, tuple(SIGNATURES))
@@ -85,6 +94,15 @@ def load_mask(path: str | os.PathLike[str]) -> Tensor:
     """Read a mask as (1, 1, H, W) bool: white (at least half of the range, mean of the colours) or nonzero is valid.
 
     Raises: as `load_field`.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     numpy.save(f"{folder}/mask.npy", numpy.eye(2))
+        ...     torchdls.load_mask(f"{folder}/mask.npy")
+        tensor([[[[ True, False],
+                  [False,  True]]]])
     """
     path = Path(path)
     content = read_file(path, tuple(SIGNATURES))
@@ -104,6 +122,16 @@ def load_camera(path: str | os.PathLike[str]) -> Tensor:
     """Read intrinsics K (3, 3) in float64 from NPY, NPZ or MAT (`camera` or `K`) or a text file of three rows.
 
     Raises: as `load_field`.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     numpy.save(f"{folder}/camera.npy", numpy.diag([800.0, 800.0, 1.0]))
+        ...     torchdls.load_camera(f"{folder}/camera.npy")
+        tensor([[800.,   0.,   0.],
+                [  0., 800.,   0.],
+                [  0.,   0.,   1.]], dtype=torch.float64)
     """
     path = Path(path)
     if path.suffix.lower() in ARRAYS:

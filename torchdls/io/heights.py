@@ -44,6 +44,13 @@ def load_height(path: str | os.PathLike[str]) -> HeightMap:
     """Read back a height that `save_height` wrote as NPZ, NPY, TIFF or PNG.
 
     Raises: as `load_field`.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     torchdls.save_height(f"{folder}/height.npz", torch.ones(4, 5))
+        ...     torchdls.load_height(f"{folder}/height.npz").height.shape
+        torch.Size([1, 1, 4, 5])
     """
     path = Path(path)
     content = read_file(path, (".npz", ".npy", ".tif", ".tiff", ".png"))
@@ -90,6 +97,13 @@ def save_height(
     Raises:
         ValueError: the suffix is unknown, a shape is wrong, or no pixel (for a mesh: no triangle) is valid.
         OSError: the directory does not exist, the file exists, or writing fails. ImportError: a library is missing.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     torchdls.save_height(f"{folder}/height.ply", torch.ones(4, 5), pixel_size=(0.5, 0.5))
+        ...     pathlib.Path(folder, "height.ply").read_bytes()[:3]
+        b'ply'
     """
     path = check_output(path, overwrite, suffixes=OUTPUT_SUFFIXES)
     values = single_map("height", height)

@@ -27,6 +27,14 @@ def save_mesh(
     Faces are counter-clockwise seen from the viewer (+z). Points in no triangle are left out.
 
     Raises: as `save_height`.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> points = torchdls.height_to_points(torch.zeros(1, 1, 3, 3))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     torchdls.save_mesh(f"{folder}/mesh.stl", points)
+        ...     pathlib.Path(folder, "mesh.stl").stat().st_size  # eight triangles of 50 bytes, and a header of 84
+        484
     """
     path = check_output(path, overwrite, suffixes=MESH_SUFFIXES)
     trimesh = require("trimesh", "files")

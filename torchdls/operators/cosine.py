@@ -28,6 +28,13 @@ def dct2(x: Tensor) -> Tensor:
         (..., H, W), in the dtype and on the device of `x`.
 
     Source: Makhoul, "A fast cosine transform in one and two dimensions", IEEE TASSP 28(1), 1980.
+
+    Example:
+        >>> coefficients = torchdls.dct2(torch.ones(4, 4))
+        >>> round(float(coefficients[0, 0]), 3)  # a constant is the first atom alone
+        4.0
+        >>> round(float(coefficients.norm()), 3)
+        4.0
     """
     h, w = x.shape[-2:]
     if max(h, w) <= MATRIX_LIMIT:
@@ -47,6 +54,11 @@ def idct2(x: Tensor) -> Tensor:
 
     Returns:
         (..., H, W), in the dtype and on the device of `x`.
+
+    Example:
+        >>> x = torch.eye(5)
+        >>> torch.allclose(torchdls.idct2(torchdls.dct2(x)), x, atol=1e-6)
+        True
     """
     h, w = x.shape[-2:]
     if max(h, w) <= MATRIX_LIMIT:

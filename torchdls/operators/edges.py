@@ -31,6 +31,13 @@ def edge_slopes(
         v: (N, 2, H, W); v[:, 0, :, j] belongs to the edge between columns j and j + 1 (0 in the last column),
             v[:, 1, i, :] to the edge between rows i and i + 1 (0 in the last row).
         w: (N, 2, H, W) on the same edges, or None where every trust is 1.
+
+    Example:
+        >>> slopes, trust = torchdls.edge_slopes(torch.arange(3.0).expand(1, 2, 1, 3))
+        >>> slopes[0, 0]  # half way between the pixels; no edge leaves the last column
+        tensor([[0.5000, 1.5000, 0.0000]])
+        >>> trust is None  # all are trusted alike
+        True
     """
     if mask is None and weight is None:
         return _pair_sums(gradient) * 0.5, None

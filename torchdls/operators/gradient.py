@@ -43,6 +43,13 @@ class GradientOperator:
 
     Raises:
         ValueError: the stencil is unknown, a kernel is not a rectangle with odd sides, or a pixel size is not positive.
+
+    Example:
+        >>> ramp = torch.arange(4.0).expand(1, 1, 3, 4)
+        >>> torchdls.GradientOperator("forward")(ramp)[0, 0]
+        tensor([[1., 1., 1., 0.],
+                [1., 1., 1., 0.],
+                [1., 1., 1., 0.]])
     """
 
     stencil: str | tuple[Kernel, Kernel] = "forward"

@@ -32,6 +32,14 @@ class Patches:
 
     Raises:
         ValueError: a size or stride is not a positive integer, or a stride exceeds its size (pixels would be left out).
+
+    Example:
+        >>> patches = torchdls.Patches(4, stride=2)
+        >>> x = patches.extract(torch.zeros(1, 1, 8, 6))
+        >>> x.shape  # 3 x 2 patches of 16 pixels
+        torch.Size([1, 16, 6])
+        >>> patches.adjoint(x, (8, 6)).shape
+        torch.Size([1, 1, 8, 6])
     """
 
     size: int | tuple[int, int] = 8

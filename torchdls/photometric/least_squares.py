@@ -39,6 +39,13 @@ def woodham(
         ValueError: a shape does not fit, a value is not finite, or `shadow` is out of range.
 
     Source: Woodham, "Photometric method for determining surface orientation from multiple images", 1980.
+
+    Example:
+        >>> normals = torchdls.gradient_to_normals(torchdls.SURFACES["peaks"](16).gradient)
+        >>> lights = torchdls.ring_of_lights(12)
+        >>> images = torchdls.render(normals, lights)
+        >>> float((torchdls.woodham(images, lights).normals - normals).abs().max()) < 0.01
+        True
     """
     samples = check("woodham", images, lights, mask, lit)
     if shadow is not None:

@@ -52,6 +52,15 @@ def low_rank_normals(
     Source: Wu, Ganesh, Shi, Matsushita, Wang, Ma, "Robust photometric stereo via low-rank matrix completion and
     recovery", ACCV 2010; Lin, Chen, Ma, "The augmented Lagrange multiplier method for exact recovery of corrupted
     low-rank matrices", 2010.
+
+    Example:
+        >>> normals = torchdls.gradient_to_normals(torchdls.SURFACES["peaks"](16).gradient)
+        >>> lights = torchdls.ring_of_lights(12)
+        >>> images = torchdls.render(normals, lights)
+        >>> images[:, 0, 4:8, 4:8] += 1.0  # a highlight
+        >>> methods = torchdls.woodham, torchdls.low_rank_normals
+        >>> [round(float((method(images, lights).normals - normals).abs().max()), 1) for method in methods]
+        [0.3, 0.1]
     """
     samples = check("low_rank_normals", images, lights, mask, lit)
     if not sparsity > 0 or not tol > 0 or not isinstance(max_iter, int) or max_iter < 1:

@@ -31,6 +31,13 @@ class PhotometricResult(NamedTuple):
             units that make its mean 1 over the pixels where it is positive. The variance of sample k is s^2 + r_k^2
             with r_k its residual from the Lambertian model and s their robust scale on the whole surface; so pixels
             that are dark, steep, lit by few lights or not Lambertian weigh less. 0 where there are no slopes.
+
+    Example:
+        >>> normals = torchdls.gradient_to_normals(torchdls.SURFACES["peaks"](16).gradient)
+        >>> lights = torchdls.ring_of_lights(10)
+        >>> result = torchdls.woodham(torchdls.render(normals, lights), lights)
+        >>> result.normals.shape, result.albedo.shape, result.confidence.shape
+        (torch.Size([1, 3, 16, 16]), torch.Size([1, 1, 16, 16]), torch.Size([1, 1, 16, 16]))
     """
 
     normals: Tensor

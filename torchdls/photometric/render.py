@@ -19,6 +19,12 @@ def ring_of_lights(
     """Directions (count, 3) of lights on a ring, `tilt` degrees from the viewer; the first to the right.
 
     ValueError unless there are at least three lights and the tilt is between 0 and 90 degrees.
+
+    Example:
+        >>> torchdls.ring_of_lights(3, tilt=30).round(decimals=2)
+        tensor([[ 0.5000,  0.0000,  0.8700],
+                [-0.2500,  0.4300,  0.8700],
+                [-0.2500, -0.4300,  0.8700]])
     """
     if count < 3 or not 0 < tilt < 90:
         raise ValueError(f"count={count!r}, tilt={tilt!r}: at least 3 lights between 0 and 90 degrees are needed")
@@ -63,6 +69,12 @@ def render(
     Raises:
         TypeError: normals or lights are not floating-point tensors.
         ValueError: a shape does not fit, or an option is out of range.
+
+    Example:
+        >>> lights = torch.tensor([[0.0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
+        >>> facing = torch.tensor([0.0, 0, 1]).view(1, 3, 1, 1)
+        >>> torchdls.render(facing, lights, albedo=0.5).flatten()
+        tensor([0.5000, 0.4000, 0.4000])
     """
     if not isinstance(normals, Tensor) or normals.dtype not in (torch.float32, torch.float64):
         got = getattr(normals, "dtype", type(normals).__name__)
@@ -110,6 +122,12 @@ def cast_shadows(height: Tensor, lights: Tensor, pixel_size: float | Sequence[fl
     Raises:
         TypeError: an argument is not a floating-point tensor.
         ValueError: a shape does not fit, or a light is not above the horizon.
+
+    Example:
+        >>> height = torch.zeros(1, 1, 1, 5)
+        >>> height[..., 2] = 3.0  # a wall
+        >>> torchdls.cast_shadows(height, torch.tensor([[0.6, 0.0, 0.8]]))  # the light stands at the right
+        tensor([[[[ True,  True, False, False, False]]]])
     """
     if not isinstance(height, Tensor) or height.dtype not in (torch.float32, torch.float64):
         got = getattr(height, "dtype", type(height).__name__)

@@ -24,7 +24,15 @@ _DIRECT_STEPS = 30
 
 
 class ConvergenceWarning(UserWarning):
-    """An iterative solve reached its limit of iterations before its tolerance."""
+    """An iterative solve reached its limit of iterations before its tolerance.
+
+    Example:
+        >>> import warnings
+        >>> slopes, mask = torchdls.SURFACES["peaks"](16).gradient, torch.ones(1, 1, 16, 16, dtype=torch.bool).triu()
+        >>> with warnings.catch_warnings(action="ignore", category=torchdls.ConvergenceWarning):
+        ...     torchdls.LeastSquares(max_iter=1)(slopes, mask).shape
+        torch.Size([1, 1, 16, 16])
+    """
 
 
 class SolveResult(NamedTuple):
@@ -35,6 +43,12 @@ class SolveResult(NamedTuple):
         iterations: (N,) conjugate-gradient steps taken; 0 where a direct solve served.
         residual: (N,) relative residual ||b - H z|| / ||b|| of the normal equations; 0 where a direct solve served.
         converged: (N,) bool, whether the residual met the tolerance.
+
+    Example:
+        >>> slopes, _ = torchdls.edge_slopes(torch.ones(2, 2, 4, 5))
+        >>> result = torchdls.solve(slopes)
+        >>> result.height.shape, result.iterations.tolist()
+        (torch.Size([2, 1, 4, 5]), [0, 0])
     """
 
     height: Tensor
@@ -96,6 +110,11 @@ def solve(
         ValueError: a shape does not fit, or `tol`, `max_iter` or `pixel_size` is not positive.
 
     Source: Simchony, Chellappa, Shao (1990) for the direct solve; Durou, Courteille (2007) for the mask.
+
+    Example:
+        >>> slopes, _ = torchdls.edge_slopes(torch.ones(1, 2, 1, 4))
+        >>> torchdls.solve(slopes).height.round(decimals=3)
+        tensor([[[[-1.5000, -0.5000,  0.5000,  1.5000]]]])
     """
     setting = _Setting(as_pixel_size(pixel_size), tol, max_iter)
     r = _as_weight(anchor_weight, v)

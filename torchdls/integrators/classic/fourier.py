@@ -36,6 +36,12 @@ class FrankotChellappa(Integrator):
 
     Source: Frankot, Chellappa, "A Method for Enforcing Integrability in Shape from Shading Algorithms", IEEE TPAMI
     10(4), 1988.
+
+    Example:
+        >>> waves = torch.sin(torch.arange(16.0) * torch.pi / 4).expand(1, 1, 16, 16)
+        >>> slopes = torch.cat([waves, 0 * waves], 1)
+        >>> round(float(torchdls.FrankotChellappa()(slopes).max()), 3)  # 4 / pi
+        1.273
     """
 
     accepts = frozenset()

@@ -82,6 +82,12 @@ class HarkerOLeary(GlobalLeastSquares):
             positive.
 
     Source: Harker, O'Leary, "Least Squares Surface Reconstruction from Measured Gradient Fields", CVPR 2008.
+
+    Example:
+        >>> slopes = torch.ones(1, 2, 16, 16)  # of a plane
+        >>> height = torchdls.HarkerOLeary()(slopes)
+        >>> round(float(height[0, 0, -1, -1] - height[0, 0, 0, 0]), 2)
+        30.0
     """
 
     def __init__(
@@ -113,6 +119,13 @@ class SpectralRegularization(GlobalLeastSquares):
 
     Source: Harker, O'Leary, "Regularized Reconstruction of a Surface from its Measured Gradient Field", Journal of
     Mathematical Imaging and Vision 51, 2015.
+
+    Example:
+        >>> surface = torchdls.SURFACES["peaks"](32)
+        >>> noisy = torchdls.add_noise(surface.gradient, 0, torch.Generator().manual_seed(0))
+        >>> methods = torchdls.HarkerOLeary(), torchdls.SpectralRegularization(modes=0.25)
+        >>> [round(float(torchdls.rmse(method(noisy), surface.height)), 2) for method in methods]
+        [0.45, 0.23]
     """
 
     def __init__(
@@ -168,6 +181,13 @@ class TikhonovRegularization(GlobalLeastSquares):
         ValueError: an option is out of its range.
 
     Source: Harker, O'Leary (2015), as in `SpectralRegularization`.
+
+    Example:
+        >>> surface = torchdls.SURFACES["peaks"](32)
+        >>> noisy = torchdls.add_noise(surface.gradient, 0, torch.Generator().manual_seed(0))
+        >>> methods = torchdls.HarkerOLeary(), torchdls.TikhonovRegularization(lam=0.5)
+        >>> [round(float(torchdls.rmse(method(noisy), surface.height)), 2) for method in methods]
+        [0.45, 0.39]
     """
 
     lam: float | Tensor

@@ -38,6 +38,12 @@ class HornBrooks(Integrator):
 
     Source: Horn, Brooks, "The Variational Approach to Shape from Shading", Computer Vision, Graphics, and Image
     Processing 33, 1986; Durou, Courteille (2007) for the border.
+
+    Example:
+        >>> slopes = torch.ones(1, 2, 16, 16)  # of a plane
+        >>> height = torchdls.HornBrooks(relaxation=1.8)(slopes)
+        >>> round(float(height[0, 0, -1, -1] - height[0, 0, 0, 0]), 2)
+        30.0
     """
 
     def __init__(

@@ -34,6 +34,14 @@ class LeastSquares(Integrator):
         ValueError: `tol`, `max_iter` or `pixel_size` is not positive, or `boundary` is unknown.
 
     Source: Simchony, Chellappa, Shao (1990); Durou, Courteille (2007); Horovitz, Kiryati (2004) for the anchors.
+
+    Example:
+        >>> torchdls.LeastSquares()(torch.ones(1, 2, 2, 3)).round(decimals=3)[0]  # a plane
+        tensor([[[-1.5000, -0.5000,  0.5000],
+                 [-0.5000,  0.5000,  1.5000]]])
+        >>> mask = torch.tensor([[True, True, False, True]]).expand(1, 1, 1, 4)
+        >>> torchdls.LeastSquares()(torch.ones(1, 2, 1, 4), mask).round(decimals=3)  # mean 0 on each part
+        tensor([[[[-0.5000,  0.5000,  0.0000,  0.0000]]]])
     """
 
     quadratic = True

@@ -31,6 +31,12 @@ class LineIntegral(Integrator):
 
     Source: after Wu, Li, "A Line-Integration Based Method for Depth Recovery from Surface Normals", Computer Vision,
     Graphics, and Image Processing 43, 1988.
+
+    Example:
+        >>> slopes = torch.ones(1, 2, 16, 16)  # of a plane
+        >>> height = torchdls.LineIntegral()(slopes)
+        >>> round(float(height[0, 0, -1, -1] - height[0, 0, 0, 0]), 2)
+        30.0
     """
 
     accepts = frozenset()

@@ -61,6 +61,13 @@ class DLSResult(NamedTuple):
         mu: (N,) the threshold used, for heights in pixels.
         converged: (N,) bool, whether the height settled to `tol` before the iterations ran out.
         iterations: (N,) the iterations each surface took.
+
+    Example:
+        >>> result = torchdls.DLS(n_iter=2).solve(torchdls.SURFACES["tent"](32).gradient)
+        >>> result.dictionary.shape, result.codes.shape
+        (torch.Size([1, 64, 64]), torch.Size([1, 64, 169]))
+        >>> bool((result.objective.diff() <= 0).all())
+        True
     """
 
     height: Tensor
@@ -138,6 +145,13 @@ class DLS(Iterative[DLSResult]):
 
     Source: Wagenmaker, Moore, Nadakuditi, "Robust surface reconstruction from gradients via adaptive dictionary
     regularization", ICIP 2017.
+
+    Example:
+        >>> surface = torchdls.SURFACES["tent"](32)
+        >>> noisy = torchdls.add_noise(surface.gradient, 5, torch.Generator().manual_seed(0))
+        >>> plain, height = torchdls.LeastSquares()(noisy), torchdls.DLS(n_iter=10)(noisy)
+        >>> bool(torchdls.rmse(height, surface.height) < 0.9 * torchdls.rmse(plain, surface.height))
+        True
     """
 
     lam: float | Tensor | str

@@ -41,6 +41,13 @@ def dls_objective(
 
     Returns:
         (N,).
+
+    Example:
+        >>> height, gradient = torch.zeros(1, 1, 16, 16), torch.zeros(1, 2, 16, 16)
+        >>> patches = torchdls.Patches(8, 8)
+        >>> codes = torch.ones(1, 64, 4)  # 256 codes that nothing asks for
+        >>> torchdls.dls_objective(height, gradient, torch.eye(64)[None], codes, lam=0.5, mu=0.0, patches=patches)
+        tensor([128.])
     """
     patches = Patches() if patches is None else patches
     data = LeastSquares()

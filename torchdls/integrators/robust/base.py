@@ -26,6 +26,13 @@ class RobustResult(NamedTuple):
         objective: (N, iterations + 1), from the start on, for heights in pixels; constant once a surface has stopped.
         iterations: (N,) the iterations each surface took.
         converged: (N,) bool, whether it met `tol` within them.
+
+    Example:
+        >>> result = torchdls.Huber().solve(torchdls.SURFACES["peaks"](16).gradient)
+        >>> result.height.shape, bool(result.converged)
+        (torch.Size([1, 1, 16, 16]), True)
+        >>> result.objective.shape[1] == int(result.iterations) + 1
+        True
     """
 
     height: Tensor

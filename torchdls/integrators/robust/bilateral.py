@@ -70,6 +70,12 @@ class Bilateral(Robust):
         ValueError: an option is out of range.
 
     Source: Cao, Santo, Shi, Okura, Matsushita, "Bilateral normal integration", ECCV 2022.
+
+    Example:
+        >>> surface = torchdls.SURFACES["peaks"](32)
+        >>> height = torchdls.Bilateral()(surface.gradient)
+        >>> round(float(torchdls.rmse(height, surface.height)), 2)
+        0.02
     """
 
     def __init__(

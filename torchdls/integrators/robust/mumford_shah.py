@@ -91,6 +91,14 @@ class MumfordShah(Robust):
 
     Source: Queau, Durou, Aujol, "Variational methods for normal integration", Journal of Mathematical Imaging and
     Vision 60, 2018; Ambrosio, Tortorelli (1990).
+
+    Example:
+        >>> surface = torchdls.SURFACES["peaks"](32)
+        >>> spoilt = surface.gradient.clone()
+        >>> spoilt[..., 10, 20] += 9.0  # one wild sample
+        >>> methods = torchdls.LeastSquares(), torchdls.MumfordShah()
+        >>> [round(float(torchdls.rmse(method(spoilt), surface.height)), 2) for method in methods]
+        [0.24, 0.04]
     """
 
     def __init__(

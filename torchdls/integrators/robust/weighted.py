@@ -41,6 +41,14 @@ class WeightedLeastSquares(LeastSquares):
 
     Source: after Queau, Durou, "Edge-preserving integration of a normal field: weighted least squares, TV and L1
     approaches", SSVM 2015; the curl as the sign of a bad slope: Agrawal, Chellappa, Raskar, ICCV 2005.
+
+    Example:
+        >>> surface = torchdls.SURFACES["peaks"](32)
+        >>> spoilt = surface.gradient.clone()
+        >>> spoilt[..., 10, 20] += 9.0  # one wild sample
+        >>> methods = torchdls.LeastSquares(), torchdls.WeightedLeastSquares()
+        >>> [round(float(torchdls.rmse(method(spoilt), surface.height)), 2) for method in methods]
+        [0.24, 0.05]
     """
 
     def __init__(

@@ -41,6 +41,11 @@ class SlopeDLSResult(NamedTuple):
             run, where there are several; where surfaces of a batch take unequal numbers, the last one repeats).
         noise: (N,) standard deviation of one gradient sample of weight 1.
         confidence: (N, 1, H, W): 0 where `robust` replaced a sample, else 1; 0 outside the mask.
+
+    Example:
+        >>> result = torchdls.SlopeDLS(recipe="quick").solve(torchdls.SURFACES["tent"](32).gradient)
+        >>> result.height.shape, result.misfit.shape
+        (torch.Size([1, 1, 32, 32]), torch.Size([1, 7]))
     """
 
     height: Tensor
@@ -136,6 +141,13 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
     Source: an extension of Wagenmaker, Moore, Nadakuditi (ICIP 2017); the noise of transform coefficients after Donoho,
     Johnstone (1994), the shifts after Coifman, Donoho (1995), "Translation-invariant de-noising", the blend after
     Ramani, Blu, Unser (2008), the slow waves after Karacali, Snyder (2004).
+
+    Example:
+        >>> surface = torchdls.SURFACES["tent"](32)
+        >>> noisy = torchdls.add_noise(surface.gradient, 5, torch.Generator().manual_seed(0))
+        >>> plain, height = torchdls.LeastSquares()(noisy), torchdls.SlopeDLS()(noisy)
+        >>> bool(torchdls.rmse(height, surface.height) < 0.7 * torchdls.rmse(plain, surface.height))
+        True
     """
 
     sigma: float | Tensor | None
