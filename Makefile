@@ -1,6 +1,6 @@
 # make demo   noisy slopes to surfaces: pictures, a page, meshes and a table in demo/
-# make test   the tests
-# make check  everything that CI runs
+# make test   the tests, but for the slow ones
+# make check  everything that CI runs: the slow tests too, lint, types, notebooks, a short run of the benchmarks
 #
 # Each makes .venv if it is missing and installs what it needs. To choose where and what:
 #   PYTHON=python3.12   the interpreter that makes .venv
@@ -18,6 +18,7 @@ PYTEST_ARGS ?=
 
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet $(addprefix --extra-index-url ,$(TORCH_INDEX)) $(TORCH)
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS)
 SCRATCH := build
 
 # Benchmarks are pytest files (bench_*.py) and scripts that take --smoke, run as modules; common/ holds their helpers.
@@ -26,7 +27,7 @@ BENCH_SCRIPTS := $(filter-out $(BENCH_TESTS),$(wildcard benchmarks/speed/*.py be
 SMOKE_SIZES := not 512 and not 1024 and not 2048 and not 64-64
 NOTEBOOKS := $(patsubst notebooks/%.py,%,$(wildcard notebooks/*.py))
 
-.PHONY: help demo test lint format types notebooks notebooks-update picture bench-smoke check clean
+.PHONY: help demo test test-slow lint format types notebooks notebooks-update picture bench-smoke check check-rest clean
 .DELETE_ON_ERROR:
 
 help:
@@ -36,7 +37,10 @@ demo: $(VENV)/.demo
 	$(BIN)/torchdls demo --out $(DEMO)
 
 test: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
+	$(PYTEST) -m "not slow" $(PYTEST_ARGS)
+
+test-slow: $(VENV)/.dev
+	$(PYTEST) -m slow $(PYTEST_ARGS)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -71,7 +75,9 @@ bench-smoke: $(VENV)/.dev
 	@set -e; for module in $(subst /,.,$(BENCH_SCRIPTS:.py=)); do echo "$$module --smoke"; \
 	$(BIN)/python -m $$module --smoke; done
 
-check: test lint types notebooks bench-smoke
+check: test check-rest
+
+check-rest: test-slow lint types notebooks bench-smoke
 
 clean:
 	rm -rf $(SCRATCH) $(DEMO) .mypy_cache .pytest_cache .ruff_cache

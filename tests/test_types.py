@@ -64,6 +64,7 @@ def mypy(tmp_path: Path, text: str) -> list[str]:
     return [line.partition("caller.py:")[2] for line in done.stdout.splitlines() if "caller.py:" in line]
 
 
+@pytest.mark.slow
 def test_calls_have_types_and_mistakes_are_errors(tmp_path: Path) -> None:
     first = RIGHT.count("\n") + 1
     text = RIGHT + "".join(f"    {line}\n" for line in WRONG)

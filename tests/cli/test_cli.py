@@ -264,6 +264,7 @@ def test_an_interrupt_is_quiet(monkeypatch, tmp_path, gradient_file, capsys):
 # --- demo ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_demo_leaves_everything_it_promises(tmp_path, capsys):
     folder = tmp_path / "new" / "demo"
     assert main(["demo", "--out", str(folder), "--size", "40", "--quiet"]) == 0

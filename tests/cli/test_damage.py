@@ -160,6 +160,7 @@ def limited(*arguments):
 
 
 @LINUX
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["huge.npy", "fine.png", "coarse.png", "huge.npz", "text.npz"])
 def test_a_header_is_not_believed(tmp_path, name):
     liars(tmp_path)
@@ -172,6 +173,7 @@ def test_a_header_is_not_believed(tmp_path, name):
 
 
 @LINUX
+@pytest.mark.slow
 def test_what_nobody_asks_for_is_not_unpacked(tmp_path):
     gradient = text_io.BytesIO()
     np.save(gradient, np.ones((2, 8, 8)))

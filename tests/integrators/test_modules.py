@@ -97,6 +97,7 @@ def test_hard_threshold_gives_mu_no_derivative() -> None:
     assert mu.grad is None or mu.grad == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"learn": "fixed"}, {"threshold": "soft", "checkpoint": True}])
 def test_a_long_chain_stays_finite(options: dict) -> None:
     """Images to normals to gradients to DLS to a loss: batch 8, 128 x 128, with everything that makes NaN elsewhere."""
@@ -120,6 +121,7 @@ def test_a_long_chain_stays_finite(options: dict) -> None:
     assert weight.grad.isfinite().all()
 
 
+@pytest.mark.slow
 @quiet
 def test_compiles_without_a_break() -> None:
     """Least squares, one sweep of SOUP-DIL, a step of the preconditioned solver, and DLS with proximal steps."""
@@ -149,6 +151,7 @@ def test_compiles_without_a_break() -> None:
         torch.testing.assert_close(compiled(*arguments), function(*arguments), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 @quiet
 @pytest.mark.parametrize(
     "module",
@@ -162,6 +165,7 @@ def test_exports_for_a_fixed_shape(module: nn.Module) -> None:
     torch.testing.assert_close(program.module()(other), module(other), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 @quiet
 def test_least_squares_in_onnx(tmp_path) -> None:
     """Up to 64 pixels a side the cosine transform is a product with a matrix, which ONNX has."""

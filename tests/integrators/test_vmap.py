@@ -35,7 +35,9 @@ def test_integrators(name, argument):
     assert one_by_one.any()
 
 
-@pytest.mark.parametrize("normals", [woodham, sparse_normals, low_rank_normals])
+@pytest.mark.parametrize(
+    "normals", [woodham, *(pytest.param(f, marks=pytest.mark.slow) for f in (sparse_normals, low_rank_normals))]
+)
 def test_photometric_methods(normals):
     lights = ring_of_lights(8, 45).double()
     generator = torch.Generator().manual_seed(4)

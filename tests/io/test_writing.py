@@ -97,6 +97,7 @@ def test_of_many_writers_exactly_one_wins(tmp_path, monkeypatch, links):
     assert all("z.bin: exists already" in message for message in lost)
 
 
+@pytest.mark.slow
 def test_what_a_killed_writer_left_is_swept_up_and_a_living_one_is_not_disturbed(tmp_path):
     code = f"""
 import os, signal

@@ -70,6 +70,7 @@ def slopes(loss: Any, masked: bool, checkpoint: bool, options: dict[str, Any]) -
     return result, torch.autograd.grad(loss(result), points, materialize_grads=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("name", CASES)
 def test_checkpoint_changes_memory_alone(name: str, masked: bool) -> None:
@@ -90,6 +91,7 @@ def test_callback_and_second_derivatives() -> None:
         torch.autograd.grad(result.height.square().sum(), g, create_graph=True)
 
 
+@pytest.mark.slow
 def test_a_sweep_keeps_no_residual() -> None:
     """What is saved between the passes: heights, dictionaries and nonzero codes, of a few iterations only."""
     g = random_field(1, 2, 40, 40).requires_grad_()

@@ -169,6 +169,7 @@ def test_select_takes_the_threshold_of_the_smaller_error():
     torch.testing.assert_close(DLS(lam=0.5, mu=found.mu, n_iter=8, tol=0, z_tol=1e-11)(gradient), found.height)
 
 
+@pytest.mark.slow
 def test_select_keeps_least_squares_where_nothing_is_to_gain_each_surface_for_itself():
     _, tent, first = selected("tent", 1)
     _, fractal, second = selected("fractal", 40)
@@ -187,6 +188,7 @@ def test_select_sets_a_given_threshold_against_least_squares():
     assert useful.lam == 0.5
 
 
+@pytest.mark.slow
 def test_the_choice_is_held_fixed_in_the_derivative():
     _, gradient, found = selected("tent", 1)
     chosen = DLS(lam=0.5, mu=found.mu, n_iter=8, tol=0, z_tol=1e-11)

@@ -39,6 +39,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Tensor]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_equals_finite_differences_of_the_converged_map(case: str, capsys: pytest.CaptureFixture[str]) -> None:
     options, fields = CASES[case]

@@ -246,6 +246,7 @@ def test_weighted_least_squares_distrusts_the_curl():
     assert (w[:, 1, -1] == 0).all()
 
 
+@pytest.mark.slow
 def test_total_variation_is_within_one_percent_soon():
     g = add_noise(SURFACES["tent"](16, dtype=torch.float64).gradient, snr_db=10, generator=seeded(0))
     g[:, 0, 3:13, 8] += 20
