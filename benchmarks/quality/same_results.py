@@ -70,7 +70,7 @@ from benchmarks.quality.same_results import heights
 assert torchdls.__file__.startswith(tree), torchdls.__file__
 numpy.savez(target, **heights(int(size)))"""
     target = scratch / f"{len(list(scratch.iterdir()))}.npz"
-    environment = {**os.environ, "PYTHONPATH": ""}
+    environment = {**os.environ, "PYTHONPATH": "", "OMP_NUM_THREADS": "1"}  # two of two threads would spin
     command = [sys.executable, "-c", code, str(tree), str(ROOT), str(target), str(size)]
     subprocess.run(command, cwd=scratch, env=environment, check=True)
     with np.load(target) as content:
