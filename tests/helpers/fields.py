@@ -1,4 +1,4 @@
-"""Small masks and random fields."""
+"""Small masks and random fields, on PyTorch's default device (see `--device`), with the same values on each."""
 
 import torch
 from torch import Tensor
@@ -11,7 +11,14 @@ def seeded(seed: int) -> torch.Generator:
 
 def random_field(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
     """Standard normal values."""
-    return torch.randn(*shape, dtype=dtype, generator=seeded(seed))
+    values = torch.randn(*shape, dtype=dtype, generator=seeded(seed), device="cpu")
+    return values.to(torch.get_default_device())
+
+
+def uniform_field(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Values between 0 and 1."""
+    values = torch.rand(*shape, dtype=dtype, generator=seeded(seed), device="cpu")
+    return values.to(torch.get_default_device())
 
 
 def _disk(h: int, w: int) -> Tensor:
@@ -32,7 +39,7 @@ def _ring_and_islands(h: int, w: int) -> Tensor:
 
 def _sieve(h: int, w: int) -> Tensor:
     """Three pixels of four, at random: many holes and a few lone pixels."""
-    return torch.rand(1, 1, h, w, generator=seeded(7)) < 0.75
+    return uniform_field(1, 1, h, w, seed=7, dtype=torch.float32) < 0.75
 
 
 # Masks as functions of height and width.

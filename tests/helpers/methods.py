@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.helpers.fields import MASKS, random_field, seeded
+from tests.helpers.fields import MASKS, random_field, uniform_field
 from torchdls import INTEGRATORS, Integrator
 
 
@@ -107,7 +107,7 @@ def everything(integrator: Integrator, g: Tensor) -> dict[str, Tensor]:
     n, _, h, w = g.shape
     known = {
         "mask": {"mask": MASKS["disk"](h, w)},
-        "weight": {"weight": torch.rand(n, 1, h, w, dtype=g.dtype, generator=seeded(5)) + 0.5},
+        "weight": {"weight": uniform_field(n, 1, h, w, seed=5, dtype=g.dtype) + 0.5},
         "anchor": {
             "anchor": random_field(n, 1, h, w, seed=6).to(g.dtype),
             "anchor_weight": torch.full((n, 1, h, w), 0.5, dtype=g.dtype),

@@ -20,6 +20,8 @@ from tests.helpers.methods import METHODS, bumps, everything, method, needs, pro
 from torchdls import INTEGRATORS, edge_slopes
 from torchdls.solvers import connected_components
 
+pytestmark = pytest.mark.device
+
 
 @pytest.fixture(params=list(INTEGRATORS))
 def name(request: pytest.FixtureRequest) -> str:

@@ -11,6 +11,8 @@ from torch import Tensor
 from tests.helpers.methods import bumps, method, needs
 from torchdls import INTEGRATORS
 
+pytestmark = pytest.mark.device
+
 
 @pytest.fixture(params=list(INTEGRATORS))
 def name(request: pytest.FixtureRequest) -> str:
@@ -30,7 +32,7 @@ def bad_calls(g: Tensor) -> list[tuple[type[Exception], str, Tensor, dict[str, A
     negative[0, 0, 1, 1], infinite[0, 0, 1, 1] = -1, torch.inf
     shape = rf"gradient \({n}, 2, {h}, {w}\)"
     return [
-        (TypeError, "gradient is a ndarray", g.numpy(), {}),
+        (TypeError, "gradient is a ndarray", g.cpu().numpy(), {}),
         (TypeError, "gradient is a NoneType", None, {}),
         (TypeError, "gradient has dtype torch.float16", g.half(), {}),
         (TypeError, "gradient has dtype torch.int64", g.long(), {}),

@@ -30,6 +30,7 @@ from torchdls import (
     WeightedLeastSquares,
 )
 
+pytestmark = pytest.mark.device
 H, W = 6, 7  # a rectangle, neither side a multiple of the stride of DLS
 
 

@@ -6,12 +6,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.helpers import uniform_field
 from tests.helpers.methods import bumps, everything, method
 from torchdls import DLS, INTEGRATORS, Integrator, LeastSquares, _registry
 from torchdls.integrators import Fields
 from torchdls.integrators.robust import Robust
 from torchdls.operators import slope_divergence
 from torchdls.solvers import solve_direct
+
+pytestmark = pytest.mark.device
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)
@@ -29,7 +32,7 @@ def test_tells_the_height_of_the_call_and_how_it_went(name: str) -> None:
 
 def test_says_when_it_did_not_converge() -> None:
     g = bumps(1)
-    weight = 0.1 + torch.rand(1, 1, 16, 14, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    weight = 0.1 + uniform_field(1, 1, 16, 14)
     with pytest.warns(UserWarning, match="stopped after 1"):
         result = LeastSquares(max_iter=1, tol=1e-12).solve(g, weight=weight)
     assert result.iterations.tolist() == [1]

@@ -4,10 +4,13 @@ import pytest
 import torch
 from torch.func import grad, vmap
 
+from tests.helpers import random_field, uniform_field
 from tests.helpers.methods import bumps, method
 from torchdls import INTEGRATORS, low_rank_normals, ring_of_lights, sparse_normals, woodham
 
+pytestmark = pytest.mark.device
 PLACES = 2
+ITERATIVE = [pytest.param(f, marks=pytest.mark.slow) for f in (sparse_normals, low_rank_normals)]
 
 
 def per_sample(f, *tensors):
@@ -25,8 +28,8 @@ def test_integrators(name, argument):
     known = INTEGRATORS.parameters(name)
     integrator = method(name).build(name, **{k: v for k, v in options.items() if k in known})
     g = bumps(PLACES, 9, 8)
-    weight = 0.5 + torch.rand(PLACES, 1, 9, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    probe = torch.randn(9, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    weight = 0.5 + uniform_field(PLACES, 1, 9, 8, seed=2)
+    probe = random_field(9, 8, seed=3)
     if argument == "gradient":
         together, one_by_one = per_sample(lambda g: (integrator(g) * probe).sum(), g)
     else:
@@ -35,13 +38,10 @@ def test_integrators(name, argument):
     assert one_by_one.any()
 
 
-@pytest.mark.parametrize(
-    "normals", [woodham, *(pytest.param(f, marks=pytest.mark.slow) for f in (sparse_normals, low_rank_normals))]
-)
+@pytest.mark.parametrize("normals", [woodham, *ITERATIVE])
 def test_photometric_methods(normals):
-    lights = ring_of_lights(8, 45).double()
-    generator = torch.Generator().manual_seed(4)
-    images = 0.2 + torch.rand(PLACES, 8, 5, 4, dtype=torch.float64, generator=generator)
+    lights = ring_of_lights(8, 45, dtype=torch.float64, device=torch.get_default_device())
+    images = 0.2 + uniform_field(PLACES, 8, 5, 4, seed=4)
     together, one_by_one = per_sample(lambda i: normals(i, lights).normals[0].sum(), images)
     torch.testing.assert_close(together, one_by_one, rtol=1e-6, atol=1e-8)
     assert one_by_one.any()
