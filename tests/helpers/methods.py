@@ -1,4 +1,4 @@
-"""How each integrator is tested: the table that drives the contract tests."""
+"""How each integrator is tested: the one table that drives the tests of contract, derivatives and robust methods."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ import torch
 from torch import Tensor
 
 from tests.helpers.fields import MASKS, random_field, uniform_field
-from torchdls import INTEGRATORS, Integrator
+from torchdls import INTEGRATORS, Integrator, LeastSquares
+from torchdls.integrators.robust import Robust
+
+Options = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -19,57 +22,115 @@ class Method:
 
     `options` make it small and quick. `tol` is the relative error up to which promises hold in float64 (solvers stop,
     thresholds switch). `smallest` is the smallest side of an image it takes. `no` maps a promise (a test's name
-    without `test_`) to the reason why the method does not make it.
+    without `test_`) to the reason why the method does not make it. `exact` are forms whose derivative finite
+    differences can follow: few iterations without an early stop, solves to the last digits.
     """
 
-    options: dict[str, Any] = field(default_factory=dict)
+    options: Options = field(default_factory=dict)
     tol: float = 1e-6
     smallest: int = 1
     no: dict[str, str] = field(default_factory=dict)
+    exact: dict[str, Options] = field(default_factory=lambda: {"default": {}})
 
     def build(self, name: str, **more: Any) -> Integrator:
         return INTEGRATORS[name](**{**self.options, **more})
 
 
 ONE_SCALE = {"components_are_independent": "one scale of slopes is read from the whole surface"}
+ONE_DICTIONARY = {
+    "components_are_independent": "they share one dictionary",
+    "follows_a_transpose": "atoms are updated one after the other, and a transpose permutes them",
+    "follows_a_quarter_turn": "as for the transpose",
+}
+SPLITTING = {"reweighting_never_raises_the_objective": "it does not reweigh: ADMM"}
+TIGHT = {"tol": 1e-13}
+FEW: Options = {"n_iter": 2, "tol": 0.0, "solve_tol": 1e-13}
+DLS_EXACT: Options = {
+    "patch_size": 3, "n_atoms": 9, "lam": 0.4, "mu": 0.35, "n_iter": 2, "tol": 0.0, "z_tol": 1e-13,
+    "data_term": LeastSquares(**TIGHT),
+}  # fmt: skip
+SLOPE_DLS_EXACT: Options = {"recipe": "plain", "patch_sizes": (3, 5), "tau": 0.8, "n_iter": 2, "z_tol": 1e-13}
 
 METHODS: dict[str, Method] = {
-    "least_squares": Method({"tol": 1e-12}),
+    "least_squares": Method(
+        {"tol": 1e-12},
+        exact={
+            "default": TIGHT,
+            "pixel_size": {**TIGHT, "pixel_size": (0.5, 2.0)},
+            "dirichlet": {**TIGHT, "boundary": "dirichlet"},
+        },
+    ),
     "frankot_chellappa": Method(no={"plane_is_exact": "a plane is not periodic"}),
-    "horn_brooks": Method({"tol": 1e-5, "relaxation": 1.8}, tol=2e-3),
+    "horn_brooks": Method(
+        {"tol": 1e-5, "relaxation": 1.8},
+        tol=2e-3,
+        no={"functional_transforms_agree": "it stops when a value says so, in plain operations, which vmap refuses"},
+        exact={"default": {"relaxation": 1.5}},
+    ),
     "spectral_regularization": Method(no={"plane_is_exact": "a few cosines do not make a plane"}),
-    "weighted_least_squares": Method({"floor": 0.1}, tol=1e-4, no=ONE_SCALE),
-    "total_variation": Method({"n_iter": 10}, tol=1e-4, no=ONE_SCALE),
-    "l1": Method({"n_iter": 10}, tol=1e-4, no=ONE_SCALE),
-    "huber": Method({"n_iter": 10}, tol=1e-4, no=ONE_SCALE),
-    "m_estimator": Method({"n_iter": 5, "floor": 0.1}, tol=1e-3, no=ONE_SCALE),
-    "anisotropic_diffusion": Method({"beta": 0.2, "n_iter": 10}, tol=1e-4, no=ONE_SCALE),
+    "weighted_least_squares": Method(
+        {"floor": 0.1}, tol=1e-4, no=ONE_SCALE, exact={"default": {"floor": 0.1, **TIGHT}}
+    ),
+    "total_variation": Method({"n_iter": 10}, tol=1e-4, no=ONE_SCALE | SPLITTING, exact={"default": FEW}),
+    "l1": Method({"n_iter": 10}, tol=1e-4, no=ONE_SCALE | SPLITTING, exact={"default": FEW}),
+    "huber": Method({"n_iter": 10}, tol=1e-4, no=ONE_SCALE | SPLITTING, exact={"default": FEW}),
+    "m_estimator": Method(
+        {"n_iter": 5, "floor": 0.1},
+        tol=1e-3,
+        no=ONE_SCALE,
+        exact={"default": {"floor": 0.1, **FEW}, "tukey": {"loss": "tukey", "floor": 0.1, **FEW}},
+    ),
+    "anisotropic_diffusion": Method(
+        {"beta": 0.2, "n_iter": 10},
+        tol=1e-4,
+        no={
+            **ONE_SCALE,
+            "outliers_do_little_harm": "its tensors come from the slopes, wrong ones too",
+            "jumps_do_little_harm": "as for outliers",
+        },
+        exact={"default": {"beta": 0.2, **FEW}},
+    ),
     "bilateral": Method(
         {"n_iter": 4, "tol": 0.0, "solve_tol": 1e-10},
         tol=1e-3,
-        no={"scales_with_the_slopes": "the rule compares with one pixel"},
+        no={
+            "scales_with_the_slopes": "the rule compares with one pixel",
+            "majoriser_touches_and_is_nowhere_below": "its quadratic holds the trusts, and bounds nothing",
+            "reweighting_never_raises_the_objective": "as it bounds nothing",
+            "dls_with_it_never_raises_its_objective": "as it bounds nothing",
+        },
+        exact={"default": FEW},
     ),
-    "mumford_shah": Method({"n_iter": 5, "floor": 0.1}, tol=1e-3, no=ONE_SCALE),
+    "mumford_shah": Method(
+        {"n_iter": 5, "floor": 0.1}, tol=1e-3, no=ONE_SCALE, exact={"default": {"floor": 0.1, **FEW}}
+    ),
     "dls": Method(
         {"patch_size": 4, "stride": 2, "n_atoms": 16, "mu": 0.3, "n_iter": 3, "tol": 0.0, "unused": "keep"},
         tol=1e-4,
         smallest=4,
         no={
+            **ONE_DICTIONARY,
             "plane_is_exact": "codes below mu are lost; it holds for mu='auto' and order='block' (see test_dls.py)",
             "scales_with_the_slopes": "mu is a fixed height; with mu='auto' it holds (tested in test_dls.py)",
-            "components_are_independent": "they share one dictionary",
-            "follows_a_transpose": "atoms are updated one after the other, and a transpose permutes them",
-            "follows_a_quarter_turn": "as for the transpose",
+        },
+        exact={
+            "default": DLS_EXACT,
+            "block": {**DLS_EXACT, "order": "block", "n_sweeps": 2, "bound": 3.0},
+            "shared": {**DLS_EXACT, "learn": "shared", "pixel_size": (0.5, 1.5)},
+            "proximal": {**DLS_EXACT, "z_step": "proximal", "n_prox": 2},
+            "soft": {**DLS_EXACT, "threshold": "soft", "mu": "auto"},
+            "firm": {**DLS_EXACT, "threshold": "firm", "order": "block"},
+            "fixed": {**DLS_EXACT, "learn": "fixed", "grad": "unroll"},
         },
     ),
     "slope_dls": Method(
         {"patch_sizes": (4, 8), "n_iter": 3},
         tol=1e-4,
-        no={
-            "components_are_independent": "they share one dictionary",
-            "follows_flips": "the grid of the patches shifts to one side",
-            "follows_a_transpose": "atoms are updated one after the other, and a transpose permutes them",
-            "follows_a_quarter_turn": "as for flips and the transpose",
+        no={**ONE_DICTIONARY, "follows_flips": "the grid of the patches shifts to one side"},
+        exact={
+            "default": SLOPE_DLS_EXACT,
+            "quick": {**SLOPE_DLS_EXACT, "recipe": "quick"},
+            "cosines": {**SLOPE_DLS_EXACT, "learn": False, "aggregate": "sparsity", "pixel_size": (0.5, 1.5)},
         },
     ),
 }
@@ -77,6 +138,23 @@ METHODS: dict[str, Method] = {
 
 def method(name: str) -> Method:
     return METHODS.get(name, Method(tol=1e-4))
+
+
+# Every form for finite differences, by name and label; a method outside the table with its defaults.
+EXACT = [(name, label) for name in INTEGRATORS for label in method(name).exact]
+
+
+def exact(name: str, label: str = "default") -> Integrator:
+    """One of them, in float64."""
+    return INTEGRATORS[name](**method(name).exact[label]).double()
+
+
+# The loops around the solve, with each loss, as functions of their options.
+ROBUST: dict[str, tuple[str, Options]] = {
+    **{name: (name, {}) for name in INTEGRATORS if issubclass(INTEGRATORS[name], Robust)},
+    "geman_mcclure": ("m_estimator", {"loss": "geman_mcclure"}),
+    "tukey": ("m_estimator", {"loss": "tukey"}),
+}
 
 
 def promising(name: str, promise: str) -> str:

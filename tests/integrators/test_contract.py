@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from tests.helpers import MASKS, assert_unchanged, random_field
-from tests.helpers.methods import METHODS, bumps, everything, method, needs, promising
+from tests.helpers.methods import bumps, everything, method, needs, promising
 from torchdls import INTEGRATORS, edge_slopes
 from torchdls.solvers import connected_components
 
@@ -49,13 +49,6 @@ def plane(p: float, q: float, shape: tuple[int, int], steps: tuple[float, float]
     y, x = torch.meshgrid(torch.arange(h, dtype=torch.float64), torch.arange(w, dtype=torch.float64), indexing="ij")
     z = (p * steps[0] * x + q * steps[1] * y)[None, None]
     return g.clone(), z - z.mean()
-
-
-def test_the_table_names_methods_and_promises() -> None:
-    assert set(METHODS) <= set(INTEGRATORS)
-    promises = {n.removeprefix("test_") for n in globals() if n.startswith("test_")}
-    for listed in METHODS.values():
-        assert set(listed.no) <= promises, "a promise that no test makes"
 
 
 # Shapes, dtypes, devices

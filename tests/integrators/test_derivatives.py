@@ -1,88 +1,22 @@
 """Derivatives of every integrator in the registry equal finite differences: first, second and forward mode.
 
-A new integrator is tested with its defaults; where it needs small or tight settings, or where PyTorch cannot give a
-derivative, it has a line in the tables below. Nothing may be detached in silence: see `test_every_input_is_reached`.
+A new integrator is tested with its defaults; where it needs small or tight settings, they are the `exact` forms of its
+line in helpers/methods.py. Nothing may be detached in silence: see `test_every_input_is_reached`.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-import torchdls
 from tests.helpers import random_field
-from torchdls import (
-    DLS,
-    INTEGRATORS,
-    L1,
-    AnisotropicDiffusion,
-    Bilateral,
-    HornBrooks,
-    Huber,
-    Integrator,
-    LeastSquares,
-    MEstimator,
-    MumfordShah,
-    SlopeDLS,
-    TotalVariation,
-    WeightedLeastSquares,
-)
+from tests.helpers.methods import EXACT, exact, method
+from torchdls import Integrator
 
 pytestmark = pytest.mark.device
 H, W = 6, 7  # a rectangle, neither side a multiple of the stride of DLS
 
-
-def dls(**options: Any) -> Callable[[], Integrator]:
-    settings = {"patch_size": 3, "n_atoms": 9, "lam": 0.4, "mu": 0.35, "n_iter": 2, "tol": 0.0, "z_tol": 1e-13}
-    return lambda: DLS(data_term=LeastSquares(tol=1e-13), **{**settings, **options})
-
-
-def slope_dls(**options: Any) -> Callable[[], Integrator]:
-    settings: dict[str, Any] = {"recipe": "plain", "patch_sizes": (3, 5), "tau": 0.8, "n_iter": 2, "z_tol": 1e-13}
-    return lambda: SlopeDLS(**(settings | options))
-
-
-FEW = {"n_iter": 2, "tol": 0.0, "solve_tol": 1e-13}
-
-# What each method is built with: nothing, unless it stands here. More than one line tests more than one form.
-VARIANTS: dict[str, dict[str, Callable[[], Integrator]]] = {
-    "least_squares": {
-        "default": lambda: LeastSquares(tol=1e-13),
-        "pixel_size": lambda: LeastSquares(tol=1e-13, pixel_size=(0.5, 2.0)),
-        "dirichlet": lambda: LeastSquares(tol=1e-13, boundary="dirichlet"),
-    },
-    "horn_brooks": {"default": lambda: HornBrooks(relaxation=1.5)},
-    "weighted_least_squares": {"default": lambda: WeightedLeastSquares(floor=0.1, tol=1e-13)},
-    "total_variation": {"default": lambda: TotalVariation(**FEW)},
-    "l1": {"default": lambda: L1(**FEW)},
-    "huber": {"default": lambda: Huber(**FEW)},
-    "m_estimator": {
-        "default": lambda: MEstimator(floor=0.1, **FEW),
-        "tukey": lambda: MEstimator("tukey", floor=0.1, **FEW),
-    },
-    "anisotropic_diffusion": {"default": lambda: AnisotropicDiffusion(beta=0.2, **FEW)},
-    "bilateral": {"default": lambda: Bilateral(**FEW)},
-    "mumford_shah": {"default": lambda: MumfordShah(floor=0.1, **FEW)},
-    "dls": {
-        "default": dls(),
-        "block": dls(order="block", n_sweeps=2, bound=3.0),
-        "shared": dls(learn="shared", pixel_size=(0.5, 1.5)),
-        "proximal": dls(z_step="proximal", n_prox=2),
-        "soft": dls(threshold="soft", mu="auto"),
-        "firm": dls(threshold="firm", order="block"),
-        "fixed": dls(learn="fixed", grad="unroll"),
-    },
-    "slope_dls": {
-        "default": slope_dls(),
-        "quick": slope_dls(recipe="quick"),
-        "cosines": slope_dls(learn=False, aggregate="sparsity", pixel_size=(0.5, 1.5)),
-    },
-}
-# Iterations that stop when a value says so, written in plain operations: vmap refuses them, and says why.
-NO_VMAP = {"horn_brooks"}
-CASES = [(name, label) for name in INTEGRATORS for label in VARIANTS.get(name, {"default": None})]
 
 mask = torch.ones(2, 1, H, W, dtype=torch.bool)
 mask[0, :, 2:4, 2:4] = False  # a hole
@@ -96,10 +30,6 @@ FIELDS: dict[str, tuple[str, ...]] = {
     "all": ("mask", "weight", "anchor", "anchor_weight"),
 }
 PARTS = ("mask", "weight", "anchor")  # what "all" holds together
-
-
-def build(name: str, label: str) -> Integrator:
-    return VARIANTS[name][label]() if name in VARIANTS else INTEGRATORS[name]()
 
 
 def inputs(integrator: Integrator, variant: str, case: str) -> dict[str, Tensor]:
@@ -134,14 +64,14 @@ def assert_close(found: Tensor, wanted: Tensor, tol: float, what: str) -> None:
 
 
 @pytest.mark.parametrize("case", ["rectangle", "all", *(pytest.param(c, marks=pytest.mark.slow) for c in PARTS)])
-@pytest.mark.parametrize("name, label", CASES)
+@pytest.mark.parametrize("name, label", EXACT)
 def test_derivatives_equal_finite_differences(name: str, label: str, case: str) -> None:
     """What gradcheck and gradgradcheck do in fast mode, by relative error, along a random direction of all inputs.
 
     J u by forward mode and <c, J u> by reverse mode against central differences of the height, and the derivative of
     J^T c along u, by double backward, against central differences of J^T c.
     """
-    integrator = build(name, label).double()
+    integrator = exact(name, label)
     call, values = as_function(integrator, inputs(integrator, label, case))
     directions = [random_field(*x.shape, seed=10 + i) / x.numel() ** 0.5 for i, x in enumerate(values)]
     step = 1e-4
@@ -175,10 +105,10 @@ def test_derivatives_equal_finite_differences(name: str, label: str, case: str) 
 
 
 @pytest.mark.parametrize("case", ["rectangle", "all"])
-@pytest.mark.parametrize("name, label", CASES)
+@pytest.mark.parametrize("name, label", EXACT)
 def test_every_input_is_reached(name: str, label: str, case: str) -> None:
     """A loss that depends on an input gives it a gradient: not None, not zero, not NaN."""
-    integrator = build(name, label).double()
+    integrator = exact(name, label)
     call, values = as_function(integrator, inputs(integrator, label, case))
     loss = call(*values).square().sum()
     for slope in torch.autograd.grad(loss, values):
@@ -186,13 +116,13 @@ def test_every_input_is_reached(name: str, label: str, case: str) -> None:
         assert slope.abs().max() > 0
 
 
-@pytest.mark.parametrize("name, label", CASES)
+@pytest.mark.parametrize("name, label", EXACT)
 def test_functional_transforms_agree(name: str, label: str) -> None:
     """vmap over two batches, and jvp against vjp."""
-    integrator = build(name, label).double()
+    integrator = exact(name, label)
     g, direction, back = random_field(2, 1, 2, H, W), random_field(1, 2, H, W, seed=4), random_field(1, 1, H, W, seed=5)
     separate = torch.stack([integrator(x) for x in g])
-    if name in NO_VMAP:
+    if "functional_transforms_agree" in method(name).no:
         with pytest.raises(RuntimeError, match="data-dependent control flow"):
             torch.vmap(integrator)(g)
     else:
@@ -200,8 +130,3 @@ def test_functional_transforms_agree(name: str, label: str) -> None:
     _, tangent = torch.func.jvp(integrator, (g[0],), (direction,))
     _, pull = torch.func.vjp(integrator, g[0])
     torch.testing.assert_close((tangent * back).sum(), (pull(back)[0] * direction).sum(), rtol=1e-8, atol=1e-9)
-
-
-def test_table_names_methods_that_exist() -> None:
-    assert set(VARIANTS) <= set(INTEGRATORS)
-    assert torchdls.INTEGRATORS is INTEGRATORS

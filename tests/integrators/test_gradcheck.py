@@ -14,7 +14,8 @@ from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
 from tests.helpers import random_field
-from tests.integrators.test_derivatives import CASES, as_function, build, inputs
+from tests.helpers.methods import EXACT, exact
+from tests.integrators.test_derivatives import as_function, inputs
 from torchdls import (
     GradientOperator,
     Patches,
@@ -101,11 +102,11 @@ def test_operators(name: str) -> None:
 
 
 @pytest.mark.parametrize("case", ["rectangle", *(pytest.param(c, marks=pytest.mark.slow) for c in ("mask", "all"))])
-@pytest.mark.parametrize("name, label", CASES)
+@pytest.mark.parametrize("name, label", EXACT)
 def test_integrators(name: str, label: str, case: str) -> None:
     if label != "default" and case != "rectangle":
         pytest.skip("the default tells")
-    integrator = build(name, label).double()
+    integrator = exact(name, label)
     call, values = as_function(integrator, inputs(integrator, label, case))
     assert gradcheck(call, values, check_forward_ad=True, fast_mode=True, nondet_tol=1e-9)
     assert gradgradcheck(call, values, fast_mode=True, nondet_tol=1e-9)

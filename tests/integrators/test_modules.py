@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from tests.helpers import random_field
+from tests.helpers.methods import method
 from torchdls import DLS, INTEGRATORS, LeastSquares, NormalsToGradient, soup_dil_sweep
 
 SMALL: dict[str, Any] = {"patch_size": 4, "n_atoms": 16, "n_iter": 3, "tol": 0.0}
@@ -27,7 +28,7 @@ def dls(**options) -> DLS:
 
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_copies_give_the_same_surface(name: str) -> None:
-    module, g = (dls() if name == "dls" else INTEGRATORS[name]()), random_field(2, 2, 16, 16, dtype=torch.float32)
+    module, g = (dls() if name == "dls" else method(name).build(name)), random_field(2, 2, 16, 16, dtype=torch.float32)
     with torch.no_grad():
         expected = module(g)
         for twin in (copy.deepcopy(module), pickle.loads(pickle.dumps(module))):
@@ -35,7 +36,7 @@ def test_copies_give_the_same_surface(name: str) -> None:
     buffer = io.BytesIO()
     torch.save(module.state_dict(), buffer)
     buffer.seek(0)
-    fresh = dls() if name == "dls" else INTEGRATORS[name]()
+    fresh = dls() if name == "dls" else method(name).build(name)
     with torch.no_grad():
         for p in fresh.parameters():
             p.zero_()

@@ -5,7 +5,7 @@ import torch
 from torch.func import grad, vmap
 
 from tests.helpers import random_field, uniform_field
-from tests.helpers.methods import bumps, method
+from tests.helpers.methods import bumps, method, promising
 from torchdls import INTEGRATORS, low_rank_normals, ring_of_lights, sparse_normals, woodham
 
 pytestmark = pytest.mark.device
@@ -22,8 +22,7 @@ def per_sample(f, *tensors):
 def test_integrators(name, argument):
     if argument not in ("gradient", *INTEGRATORS[name].accepts):
         pytest.skip(f"{name} takes no {argument}")
-    if name == "horn_brooks":
-        pytest.skip("horn_brooks relaxes in place, which vmap refuses")
+    promising(name, "functional_transforms_agree")
     options = {"tol": 0.0, "n_iter": 2} if "n_iter" in INTEGRATORS.parameters(name) else {}
     known = INTEGRATORS.parameters(name)
     integrator = method(name).build(name, **{k: v for k, v in options.items() if k in known})

@@ -1,5 +1,9 @@
 """The robust integrators against SciPy, brute force, and what outliers and jumps do to least squares."""
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -7,8 +11,10 @@ from scipy.optimize import linprog, minimize
 from torch import Tensor
 
 from tests.helpers.fields import MASKS, random_field, seeded
+from tests.helpers.methods import ROBUST, promising
 from torchdls import (
     DLS,
+    INTEGRATORS,
     L1,
     SURFACES,
     AnisotropicDiffusion,
@@ -23,17 +29,13 @@ from torchdls import (
 )
 from torchdls.integrators.robust.convex import shrink
 
-ALL = {
-    "total_variation": TotalVariation,
-    "l1": L1,
-    "huber": Huber,
-    "cauchy": MEstimator,
-    "geman_mcclure": lambda **k: MEstimator("geman_mcclure", **k),
-    "tukey": lambda **k: MEstimator("tukey", **k),
-    "mumford_shah": MumfordShah,
-    "diffusion": AnisotropicDiffusion,
-}
-robust = pytest.mark.parametrize("make", ALL.values(), ids=ALL)
+
+@pytest.fixture(params=ROBUST)
+def make(request: pytest.FixtureRequest) -> Callable[..., Any]:
+    """A robust integrator, as a function of its options."""
+    name, options = ROBUST[request.param]
+    promising(name, request.node.originalname.removeprefix("test_"))
+    return partial(INTEGRATORS[name], **options)
 
 
 def residual_rows(g: Tensor, mask: Tensor | None = None, weight: Tensor | None = None):
@@ -178,7 +180,6 @@ def test_shrink_of_vectors_by_brute_force():
     torch.testing.assert_close(shrink(x, x.norm(), step, corner), best, atol=2e-3, rtol=0)
 
 
-@robust
 @pytest.mark.parametrize("mask", [None, "sieve"])
 def test_majoriser_touches_and_is_nowhere_below(make, mask):
     method = make(pixel_size=(0.8, 1.25))
@@ -205,7 +206,6 @@ def test_majoriser_touches_and_is_nowhere_below(make, mask):
     torch.testing.assert_close(quadratic(small) + base, method.data_cost(fields, small), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("make", list(ALL.values())[3:], ids=list(ALL)[3:])
 def test_reweighting_never_raises_the_objective(make):
     g = add_noise(SURFACES["vase"](32, dtype=torch.float64).gradient, snr_db=10, generator=seeded(0))
     g[..., 10:20, 16] += 5
@@ -215,7 +215,6 @@ def test_reweighting_never_raises_the_objective(make):
     assert result.objective[0, -1] < result.objective[0, 0]
 
 
-@pytest.mark.parametrize("make", list(ALL.values())[:-1], ids=list(ALL)[:-1])
 def test_outliers_do_little_harm(make):
     surface = SURFACES["vase"](32, dtype=torch.float64)
     g = add_noise(surface.gradient, snr_db=25, generator=seeded(0))
@@ -225,7 +224,6 @@ def test_outliers_do_little_harm(make):
     assert error < 0.25 * rmse(LeastSquares()(g), surface.height)
 
 
-@pytest.mark.parametrize("make", list(ALL.values())[:-1], ids=list(ALL)[:-1])
 def test_jumps_do_little_harm(make):
     """A wrong wall of slopes, as along an occluding contour."""
     surface = SURFACES["vase"](32, dtype=torch.float64)
@@ -256,7 +254,6 @@ def test_total_variation_is_within_one_percent_soon():
     assert result.objective[0, -1] <= 1.01 * reference
 
 
-@robust
 def test_each_surface_stops_on_its_own(make):
     g = torch.cat([SURFACES[s](12, dtype=torch.float64).gradient for s in ("tent", "vase")])
     g = g + 0.05 * random_field(*g.shape)
@@ -269,28 +266,34 @@ def test_each_surface_stops_on_its_own(make):
         torch.testing.assert_close(both.objective[i, -1], alone.objective[0, -1])
 
 
-@robust
 def test_plane_is_exact(make):
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in (7, 9)), indexing="ij")
     z = (2 * x - 3 * y)[None, None]
     g = torch.stack([torch.full_like(x, 2 / 0.5), torch.full_like(x, -3 / 2.0)])[None]
-    result = make(pixel_size=(0.5, 2.0)).solve(g)
+    result = make(pixel_size=(0.5, 2.0), solve_tol=1e-12).solve(g)
     assert result.converged.all()
     torch.testing.assert_close(result.height, z - z.mean(), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("make", [*ALL.values(), WeightedLeastSquares], ids=[*ALL, "weighted"])
 @pytest.mark.parametrize("mask", [None, "disk"])
 def test_dls_with_it_never_raises_its_objective(make, mask):
+    check_descent(make(), mask)
+
+
+@pytest.mark.parametrize("mask", [None, "disk"])
+def test_dls_with_weighted_least_squares_never_raises_its_objective(mask):
+    check_descent(WeightedLeastSquares(), mask)
+
+
+def check_descent(data_term, mask):
     g = add_noise(SURFACES["tent"](24, dtype=torch.float64).gradient, snr_db=8, generator=seeded(0))
     g[:, 1, 12, 5:15] += 3
-    model = DLS(stride=4, data_term=make(), tol=0, n_iter=3, lam=0.5, mu=0.2, z_tol=1e-9)
+    model = DLS(stride=4, data_term=data_term, tol=0, n_iter=3, lam=0.5, mu=0.2, z_tol=1e-9)
     objective = model.solve(g, None if mask is None else MASKS[mask](24, 24)).objective
     assert (objective.diff(dim=1) <= 1e-9 * objective[:, :1]).all()
     assert objective[0, -1] < objective[0, 0]
 
 
-@robust
 def test_derivatives_of_the_iterations_run(make):
     method = make(n_iter=2, tol=0, solve_tol=1e-13)
     mask = MASKS["sieve"](5, 6)
