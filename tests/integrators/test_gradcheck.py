@@ -84,17 +84,17 @@ OPERATORS: dict[str, tuple[Callable[..., Tensor | tuple[Tensor, ...]], tuple[Ten
     "normals and camera": (lambda n, c: normals_to_gradient(n, camera=c).gradient, (gradient_to_normals(g), camera)),
     "gradient to normals": (gradient_to_normals, (g,)),
     "photometric stereo": (lambda x, lights: woodham(x, lights).normals, (images, directions)),
-    **{
-        f"sweep, {o}, {t}": (sweep(o, t), (P, atoms, B, mu))
-        for o in ("atom", "block")
-        for t in ("hard", "soft", "firm")
-    },
+}
+SWEEPS = {
+    f"sweep, {order}, {threshold}": (sweep(order, threshold), (P, atoms, B, mu))
+    for order in ("atom", "block")
+    for threshold in ("hard", "soft", "firm")
 }
 
 
-@pytest.mark.parametrize("name", OPERATORS)
+@pytest.mark.parametrize("name", [*OPERATORS, *(pytest.param(name, marks=pytest.mark.slow) for name in SWEEPS)])
 def test_operators(name: str) -> None:
-    operator, tensors = OPERATORS[name]
+    operator, tensors = (OPERATORS | SWEEPS)[name]
     points = [t.detach().clone().requires_grad_() for t in tensors]
     iterates = name.startswith("solve, ")  # entry by entry, these take too long
     assert gradcheck(operator, points, check_forward_ad=True, fast_mode=iterates, nondet_tol=1e-12)

@@ -158,6 +158,7 @@ def selected(surface, snr, **options):
     return surface, gradient, DLS(select=True, n_iter=8, tol=0, z_tol=1e-11, **options).solve(gradient)
 
 
+@pytest.mark.slow
 def test_select_takes_the_threshold_of_the_smaller_error():
     """On a strongly noisy Tent it raises the threshold, and gains by it."""
     surface, gradient, found = selected("tent", 1)

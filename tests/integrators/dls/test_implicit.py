@@ -77,6 +77,7 @@ def test_equals_finite_differences_of_the_converged_map(case: str, capsys: pytes
     assert max(errors.values()) <= 1e-5
 
 
+@pytest.mark.slow
 def test_other_modes_and_what_they_promise(capsys: pytest.CaptureFixture[str]) -> None:
     """Unrolled to the end it is the implicit derivative; with a frozen dictionary it is not; without, there is none."""
     g, c = random_field(1, 2, H, W), random_field(1, 1, H, W, seed=9)
@@ -97,6 +98,7 @@ def test_other_modes_and_what_they_promise(capsys: pytest.CaptureFixture[str]) -
     assert not converged("none")(g.clone().requires_grad_()).requires_grad
 
 
+@pytest.mark.slow
 def test_second_derivative_and_transforms() -> None:
     """Double backward, forward mode and vmap of the implicit solve."""
     model = converged()

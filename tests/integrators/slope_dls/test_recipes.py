@@ -183,6 +183,7 @@ def test_caution_keeps_least_squares_of_texture_and_the_rest_of_noise():
 # The whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recipe, least", [("blend", (1.3, 1.9)), ("quick", (1.15, 1.4))])
 def test_gain_over_least_squares(recipe, least):
     gains = []
