@@ -46,3 +46,11 @@ def holds_everywhere(condition: Tensor) -> bool:
 def seen_everywhere(condition: Tensor) -> bool:
     """Whether a condition is seen to hold everywhere; False where values cannot be seen."""
     return is_concrete(condition) and bool(condition.all())
+
+
+def all_finite(field: Tensor) -> bool:
+    """Whether every value is finite; one sum mostly tells, and only a sum that overflows needs the second look.
+
+    True where values cannot be seen.
+    """
+    return not is_concrete(field) or bool(field.detach().sum().isfinite()) or bool(field.isfinite().all())

@@ -181,7 +181,8 @@ def test_surfaces_of_a_batch_do_not_touch_each_other():
     for n in range(3):
         alone = solve(v[n : n + 1], w[n : n + 1], tol=1e-6)
         assert int(together.iterations[n]) == int(alone.iterations)
-        torch.testing.assert_close(together.height[n : n + 1], alone.height, rtol=1e-9, atol=0)
+        scale = float(alone.height.abs().max())
+        torch.testing.assert_close(together.height[n : n + 1], alone.height, rtol=0, atol=1e-9 * scale)
 
 
 def test_a_larger_window_of_the_batch_changes_nothing_beyond_the_tolerance():

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torchdls._checks import check_field
+from torchdls._checks import check_field, require
 from torchdls._options import plain, same, shown
+from torchdls._tracing import all_finite
 from torchdls.integrators.data_term import edge_cost
 from torchdls.integrators.fields import Fields as Fields
 from torchdls.integrators.fields import check_accepted, check_values, fit_fields, within_mask
@@ -97,12 +98,13 @@ class Integrator(nn.Module, ABC):
         Raises:
             TypeError: an argument is not a tensor, or the mask is not bool.
             ValueError: a shape, dtype or device does not fit, a value inside the mask is not finite, a weight is
-                negative, a mask is all False, an anchor comes without its weight, or the method does not take one of
-                them (see `accepts`). The message names the argument and the shapes.
+                negative, a mask is all False, an anchor comes without its weight, the method does not take one of them
+                (see `accepts`), or the height is beyond what its dtype can hold. The message names the argument and
+                the shapes.
         """
         fields = self.check(gradient, mask, weight, anchor, anchor_weight)
         height = self.integrate(fields)
-        height = height if self.unit == 1 else height * self.unit
+        height = self._finite(height if self.unit == 1 else height * self.unit)
         return height if gradient.ndim == 4 else height[0]
 
     if TYPE_CHECKING:  # the call of `nn.Module` gives Any
@@ -176,7 +178,7 @@ class Integrator(nn.Module, ABC):
         """
         fields = self.check(gradient, mask, weight, anchor, anchor_weight)
         result = self.told(fields)
-        return result._replace(height=result.height * self.unit)
+        return result._replace(height=self._finite(result.height * self.unit))
 
     def told(self, fields: Fields) -> IntegrationResult:
         """The height in pixels from checked fields, and how it went; a method that iterates says so."""
@@ -191,6 +193,14 @@ class Integrator(nn.Module, ABC):
     def data_cost(self, fields: Fields, z: Tensor) -> Tensor:
         """(N,) the data term at z."""
         return edge_cost(z, *self.edges(fields), fields.steps)
+
+    def _finite(self, height: Tensor) -> Tensor:
+        """The height, if the numbers of its dtype reach so far."""
+        require(
+            all_finite(height),
+            f"{type(self).__name__}: the height is not finite: slopes, weights or anchors are beyond {height.dtype}",
+        )
+        return height
 
     @property
     def unit(self) -> float:

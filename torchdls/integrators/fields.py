@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_fit, require
-from torchdls._tracing import holds_everywhere, is_concrete
+from torchdls._tracing import all_finite, holds_everywhere
 
 
 class Fields(NamedTuple):
@@ -31,11 +31,6 @@ class Fields(NamedTuple):
     anchor: Tensor | None
     anchor_weight: Tensor | None
     steps: tuple[float, float]
-
-
-def _all_finite(field: Tensor) -> bool:
-    """Whether every value is finite; one sum mostly tells, and only a sum that overflows needs the second look."""
-    return not is_concrete(field) or bool(field.detach().sum().isfinite()) or bool(field.isfinite().all())
 
 
 def check_accepted(name: str, accepts: frozenset[str], **given: object) -> None:
@@ -86,7 +81,7 @@ def check_values(name: str, fields: Fields) -> None:
     for label in ("gradient", "weight", "anchor", "anchor_weight"):
         field = getattr(fields, label)
         if field is not None:
-            require(_all_finite(field), f"{name}: {label} {tuple(field.shape)} is not finite{inside}")
+            require(all_finite(field), f"{name}: {label} {tuple(field.shape)} is not finite{inside}")
             weight = label.endswith("weight")
             require(
                 not weight or holds_everywhere(field >= 0), f"{name}: {label} {tuple(field.shape)} is negative{inside}"

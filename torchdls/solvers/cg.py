@@ -34,6 +34,7 @@ def conjugate_gradients(
     tol: float,
     max_iter: int,
     project: LinearMap | None = None,
+    deflate: LinearMap | None = None,
     scale: Tensor | None = None,
 ) -> CGResult:
     """Solve H x = b for every system of the batch.
@@ -48,9 +49,12 @@ def conjugate_gradients(
         max_iter: limit of iterations.
         project: orthogonal projection on the range of a singular H. Rounding leaves it, and a preconditioner that does
             not commute with it would take what is outside for progress. It may overwrite its argument.
+        deflate: oblique projection v -> v - H e (e^T v) / (e^T H e) along directions e that the caller solves for; b
+            must have no part along them, and x is right up to them.
         scale: (N,) what residuals are measured by; None for ||b||.
 
-    A system that has stopped is frozen: its result does not depend on its neighbours in the batch.
+    A system that has stopped is frozen: its result does not depend on its neighbours in the batch. None ends worse than
+    where it started, nor than from 0.
     """
     norm = _norm(b)
     scale = norm if scale is None else scale
@@ -61,7 +65,12 @@ def conjugate_gradients(
         x = torch.where(norm.view(-1, *[1] * (b.ndim - 1)) > 0, x0, 0)
         r = b - apply(x)
         r = r if project is None else project(r)  # a guess outside the range of H brings a residual that is too
-    active = _norm(r) > goal
+        worse = _norm(r) > norm  # than no guess at all
+        x, r = (
+            torch.where(worse.view(-1, *[1] * (b.ndim - 1)), t, own) for t, own in ((torch.zeros_like(b), x), (b, r))
+        )
+    began, before = (x.clone(), _norm(r)) if x0 is not None else (None, _norm(r))
+    active = before > goal
     iterations = torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
     p, rho = torch.zeros_like(b), torch.ones_like(goal)
     for _ in range(max_iter):
@@ -70,7 +79,7 @@ def conjugate_gradients(
         y = precondition(r)
         rho_new = _dot(r, y)
         p.mul_(_ratio(rho_new, rho, iterations > 0, p)).add_(y)  # in place: new memory costs as much as the arithmetic
-        q = apply(p)
+        q = apply(p) if deflate is None else deflate(apply(p))
         step = _ratio(rho_new, _dot(p, q), active, p)
         x.addcmul_(p, step)
         r.addcmul_(q, step, value=-1)
@@ -78,7 +87,13 @@ def conjugate_gradients(
         rho = rho_new
         iterations += active
         active = active & (_norm(r) > goal)
-    residual = _norm(r) / torch.where(scale > 0, scale, 1)
+    final = _norm(r)
+    lost = ~(final <= before)  # by rounding, or because the system is not what it should be: NaN too
+    if bool(lost.any()):
+        spoilt = lost.view(-1, *[1] * (b.ndim - 1))
+        x = torch.where(spoilt, 0 if began is None else began, x)
+        final = torch.where(lost, before, final)
+    residual = final / torch.where(scale > 0, scale, 1)
     return CGResult(x, iterations, residual, ~active)
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchdls._tracing import all_finite
 from torchdls.operators import GradientOperator, as_pixel_size
 from torchdls.operators.edges import edge_ends, present_edges
 from torchdls.solvers.cg import CGResult, LinearMap, conjugate_gradients
@@ -15,12 +17,15 @@ from torchdls.solvers.components import Gauge, free_constants
 from torchdls.solvers.direct import solve_direct
 from torchdls.solvers.nested_dissection import factor
 from torchdls.solvers.preconditioner import preconditioner
+from torchdls.solvers.units import Problem, in_units, plane_of, unit_of
 
 # Steps of conjugate gradients after which a direct factor is cheaper; pixels of a batch up to which its memory (2 GB)
 # is spent; steps that it then takes at most.
 _PATIENCE = 60
 _LARGEST = 2**22
 _DIRECT_STEPS = 30
+# Anchors below this part of the weight of edges leave the constant of a component to rounding, unless it is set apart.
+_WEAK = 1e-4
 
 
 class ConvergenceWarning(UserWarning):
@@ -41,7 +46,9 @@ class SolveResult(NamedTuple):
     Attributes:
         height: (N, 1, H, W).
         iterations: (N,) conjugate-gradient steps taken; 0 where a direct solve served.
-        residual: (N,) relative residual ||b - H z|| / ||b|| of the normal equations; 0 where a direct solve served.
+        residual: (N,) relative residual ||b - H z|| / ||b|| of the normal equations, once the best plane, the constants
+            that anchors ask for and the heights of firm anchors are taken out of b, and every component is brought to
+            one scale; 0 where a direct solve served.
         converged: (N,) bool, whether the residual met the tolerance.
 
     Example:
@@ -89,6 +96,11 @@ def solve(
     component (of the edges with w > 0) that no anchor holds, the height has zero mean; pixels with neither edge nor
     anchor are 0. No ridge is added.
 
+    Weights, anchors and slopes may have any scale: each component is solved in units of its own (powers of two, so
+    nothing is rounded), less the plane that fits it best and the mean of its anchors. Neither firm anchors nor those
+    far from 0 nor weak ones (down to 1e-300 of the edges) nor a steeper component swallow the tolerance of the rest.
+    Weights of anchors above 2^60 times the largest edge weight (2^40 in float32) act as that.
+
     The derivative is implicit and as exact as the solve itself: with lambda = H^{-1} dL/dz,
     dL/dv = w A lambda, dL/dw = (v - A z)(A lambda), dL/da = r lambda, dL/dr = (a - z) lambda. Memory does not grow
     with the iterations. `z0` is a guess and carries no derivative; which edges have w > 0 is taken as fixed.
@@ -98,7 +110,12 @@ def solve(
         w: (N, 2, H, W) trust in each edge, at least 0; None for 1 everywhere.
         anchor: (N, 1, H, W) anchor heights a; None for 0.
         anchor_weight: r, at least 0: (N, 1, H, W), or (N, 1, 1, 1) or a number for a whole surface; None for 0.
-        tol: relative residual at which a surface stops.
+        tol: relative residual at which a surface stops. The error of the height, relative to its relief, is mostly far
+            below it: measured over 192 masked problems (48^2 and 128^2; disks, holes, sieves and corridors; pixels 1:1
+            to 1:1000; weights up to four orders apart; smooth slopes and pure noise) at tol = 1e-4 and 1e-6, its median
+            is tol / 700, and it is at most 5 tol on a disk of square pixels. It can exceed tol: 500 tol on square
+            pixels (a sieve), 3200 tol on pixels 1:1000 (noise). For derivatives that are to pass
+            `torch.autograd.gradcheck`, ask for 1e-12 in float64.
         max_iter: limit of conjugate-gradient steps; `ConvergenceWarning` when it is reached.
         z0: (N, 1, H, W) warm start of the conjugate gradients.
         pixel_size: (dx, dy) or one number.
@@ -107,7 +124,8 @@ def solve(
         SolveResult(height, iterations, residual, converged).
 
     Raises:
-        ValueError: a shape does not fit, or `tol`, `max_iter` or `pixel_size` is not positive.
+        ValueError: a shape does not fit, `tol`, `max_iter` or `pixel_size` is not positive, or the height is not
+            finite.
 
     Source: Simchony, Chellappa, Shao (1990) for the direct solve; Durou, Courteille (2007) for the mask.
 
@@ -119,15 +137,49 @@ def solve(
     setting = _Setting(as_pixel_size(pixel_size), tol, max_iter)
     r = _as_weight(anchor_weight, v)
     _check(v, setting, w=w, anchor=anchor, anchor_weight=r, z0=z0)
-    weighted = v if w is None else w * v
-    b = _A(setting).adjoint(weighted)
-    if r is not None and anchor is not None:
-        b = b + r * anchor
     if w is None and (r is None or r[0].numel() == 1):
-        return direct_result(solve_direct(b, r, setting.pixel_size))
+        return _finite(direct_result(_on_rectangle(v, anchor, r, setting.pixel_size)))
     w = present_edges(v) if w is None else w.expand_as(v)
-    r = torch.zeros_like(b) if r is None else r.expand_as(b)
-    return SolveResult(*_Solve.apply(b, w, r, z0, None, None, setting)[:4])
+    r = None if r is None else r.expand_as(v[:, :1])
+    return _finite(_in_general(Problem(v, w, anchor, r, z0, setting.pixel_size), setting))
+
+
+def _finite(result: SolveResult) -> SolveResult:
+    """The result, if the numbers of its dtype reach so far."""
+    if not all_finite(result.height):
+        raise ValueError(
+            f"solve: the height is not finite: slopes, weights or anchors are not, or beyond {result.height.dtype}"
+        )
+    return result
+
+
+def _on_rectangle(v: Tensor, anchor: Tensor | None, r: Tensor | None, pixel_size: tuple[float, float]) -> Tensor:
+    """The direct solve. The mean of the height is that of the anchors however weak they are, so it is set apart."""
+    b = GradientOperator("forward", pixel_size).adjoint(v)
+    if r is None or anchor is None:
+        return solve_direct(b, r, pixel_size)
+    sides = zip(v.shape[:-3:-1], pixel_size, strict=True)
+    least = torch.finfo(v.dtype).eps * min((math.pi / n / d) ** 2 for n, d in sides)
+    mean = anchor.mean((-2, -1), keepdim=True)
+    b = b + r * (anchor - mean)
+    weak = (r > 0) & (r < least)  # they bend nothing, and what rounding makes of the mean would be divided by them
+    z = solve_direct(b - b.mean((-2, -1), keepdim=True), r + torch.where(weak, least, 0), pixel_size)
+    return z - z.mean((-2, -1), keepdim=True) + torch.where(r > 0, mean, 0)
+
+
+def _in_general(problem: Problem, setting: _Setting) -> SolveResult:
+    """The iterative solve, on numbers of order 1 and without the plane and constants that could drown the rest."""
+    problem, unit = in_units(problem)
+    v, w, anchor, r, z0, pixel_size = problem
+    setting = setting._replace(pixel_size=pixel_size)
+    slope, level, lift, *found = _Levels.apply(v, w, anchor, r, setting)
+    force = _A(setting).adjoint(w * (v - slope))
+    if r is None:
+        r = pull = torch.zeros_like(force)
+    else:
+        pull = r * -level if anchor is None else r * (anchor - level)
+    z, *told = _Solve.apply(force, pull, w, r, None if z0 is None else z0 - level, *found, setting)
+    return SolveResult((z + lift) * unit, *told)
 
 
 def direct_result(z: Tensor) -> SolveResult:
@@ -161,64 +213,119 @@ def _check(v: Tensor, setting: _Setting, **fields: Tensor | None) -> None:
             raise ValueError(f"solve: {name} {tuple(field.shape)} does not fit v {tuple(v.shape)}")
 
 
-class _Solve(torch.autograd.Function):
-    """z = H(w, r)^+ b by conjugate gradients, with the implicit derivative dz = H^+ (db - dH z).
+class _Levels(torch.autograd.Function):
+    """The gauge of a problem, and the plane and constant that are taken out of each component of it.
 
-    It runs in the window of the pixels that have an edge or an anchor, outside of which z = 0. Besides z and how the
-    solve went, the outputs hold the gauge in that window, so that the adjoint solve need not find it again.
+    None of it needs a derivative: which weights are 0 is fixed, and heights do not depend on planes and constants.
+
+    Returns:
+        The slopes of the planes (N, 2, H, W) or (N, 2, 1, 1); what anchors and heights lose (N, 1, H, W); what heights
+        get back, the same but for the mean of free components; first and last row and column of the window (N, 4);
+        labels, share and pull of the gauge.
+    """
+
+    @staticmethod
+    def forward(v: Tensor, w: Tensor, anchor: Tensor | None, r: Tensor | None, setting: _Setting) -> tuple[Tensor, ...]:
+        size = (w.shape[-2], w.shape[-1])
+        alive = edge_ends(w) > 0 if r is None else edge_ends(w) + r > 0
+        bounds = _live_window(alive)
+        rows, columns = _slices(bounds)
+        cut = w[..., rows, columns], None if r is None else r[..., rows, columns]
+        gauge = free_constants(*cut, least=_WEAK).embed(rows, columns, size)
+        slope = torch.cat([gauge.mean(v[:, i : i + 1], w[:, i : i + 1]) for i in (0, 1)], 1)
+        plane = plane_of(slope, size, setting.pixel_size)
+        level, lift = plane, gauge.remove(plane)
+        if r is not None:
+            constant = gauge.mean(-plane if anchor is None else anchor - plane, r)
+            level, lift = level + constant, lift + constant
+        level, lift = torch.where(alive, level, 0), torch.where(alive, lift, 0)
+        return slope, level, lift, bounds.expand(len(w), -1), *gauge
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
+        ctx.mark_non_differentiable(*output)
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> tuple[None, ...]:
+        return (None,) * 5
+
+    @staticmethod
+    def jvp(ctx: Any, *_: Any) -> tuple[None, ...]:
+        return (None,) * 7
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        outputs = _Levels.apply(*fold_vmap(info.batch_size, in_dims, inputs))
+        return tuple(x.unflatten(0, (info.batch_size, -1)) for x in outputs), (0,) * len(outputs)
+
+
+class _Solve(torch.autograd.Function):
+    """z = H(w, r)^+ (f + s) by conjugate gradients, with the implicit derivative dz = H^+ (df + ds - dH z).
+
+    The sum of f over a component is 0, as it comes from edges, and that of s where anchors hold a component: what s
+    asks of the constants is kept apart (`Gauge.constants`), as it may be larger than all the rest by many orders.
+    It runs in the window of the pixels that have an edge or an anchor, outside of which z = 0.
     """
 
     @staticmethod
     def forward(
-        b: Tensor,
+        f: Tensor,
+        s: Tensor,
         w: Tensor,
         r: Tensor,
         z0: Tensor | None,
-        labels: Tensor | None,
-        share: Tensor | None,
+        bounds: Tensor,
+        labels: Tensor,
+        share: Tensor,
+        pull: Tensor,
         setting: _Setting,
     ) -> tuple[Tensor, ...]:
-        z = torch.zeros_like(b)
-        rows, columns = _live_window(w, r)
-        b, w, r = (t[..., rows, columns] for t in (b, w, r))
+        z, size = torch.zeros_like(f), (f.shape[-2], f.shape[-1])
+        rows, columns = _slices(bounds)
+        gauge = Gauge(labels, share, pull).window(rows, columns, size)
+        b, w, r = ((f + s)[..., rows, columns], w[..., rows, columns], r[..., rows, columns])
         z0 = None if z0 is None else z0[..., rows, columns]
-        gauge = free_constants(w, r) if labels is None or share is None else Gauge(labels, share)
         x, iterations, residual, converged = _iterate(b, w, r, z0, gauge, setting)
         if not bool(converged.all()):
             _warn(residual, converged, setting)
-        z[..., rows, columns] = gauge.remove(x)
-        # Views, since an input may not come back as it is.
-        return z, iterations, residual, converged, *(t.view_as(t) for t in gauge)
+        z[..., rows, columns] = x
+        return z, iterations, residual, converged
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
-        _, w, r, *_, setting = inputs
-        z, *others = output
-        labels, share = others[-2:]
-        ctx.mark_non_differentiable(*others)
-        ctx.save_for_backward(z, w, r, labels, share)
-        ctx.save_for_forward(z, w, r, labels, share)
+        _, _, w, r, _, *found, setting = inputs
+        z, *told = output
+        ctx.mark_non_differentiable(*told)
+        ctx.save_for_backward(z, w, r, *found)
+        ctx.save_for_forward(z, w, r, *found)
         ctx.setting = setting
 
     @staticmethod
     def backward(ctx: Any, dz: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        z, w, r, labels, share = ctx.saved_tensors
-        adjoint = _Solve.apply(dz, w, r, None, labels, share, ctx.setting)[0]
+        z, w, r, bounds, *gauge = ctx.saved_tensors
+        constants = Gauge(*gauge).constants(dz, r)
+        bent = _Solve.apply(torch.zeros_like(dz), dz - r * constants, w, r, None, bounds, *gauge, ctx.setting)[0]
+        adjoint = bent + constants
         a = _A(ctx.setting)
-        dw = -a(adjoint) * a(z) if ctx.needs_input_grad[1] else None
-        dr = -adjoint * z if ctx.needs_input_grad[2] else None
-        return adjoint, dw, dr, None, None, None, None
+        dw = -a(bent) * a(z) if ctx.needs_input_grad[2] else None
+        dr = -adjoint * z if ctx.needs_input_grad[3] else None
+        return bent, adjoint, dw, dr, None, None, None, None, None, None
 
     @staticmethod
-    def jvp(ctx: Any, db: Tensor | None, dw: Tensor | None, dr: Tensor | None, *_: Any) -> tuple[Tensor | None, ...]:
-        z, w, r, labels, share = ctx.saved_tensors
+    def jvp(
+        ctx: Any, df: Tensor | None, ds: Tensor | None, dw: Tensor | None, dr: Tensor | None, *_: Any
+    ) -> tuple[Tensor | None, ...]:
+        z, w, r, bounds, *gauge = ctx.saved_tensors
         a = _A(ctx.setting)
-        rhs = torch.zeros_like(z) if db is None else db
+        force = torch.zeros_like(z) if df is None else df
+        pull = torch.zeros_like(z) if ds is None else ds
         if dw is not None:
-            rhs = rhs - a.adjoint(dw * a(z))
+            force = force - a.adjoint(dw * a(z))
         if dr is not None:
-            rhs = rhs - dr * z
-        return _Solve.apply(rhs, w, r, None, labels, share, ctx.setting)[0], None, None, None, None, None
+            pull = pull - dr * z
+        constants = Gauge(*gauge).constants(pull, r)
+        bent = _Solve.apply(force, pull - r * constants, w, r, None, bounds, *gauge, ctx.setting)[0]
+        return bent + constants, None, None, None
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
@@ -230,81 +337,79 @@ def _iterate(b: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, s
     """Conjugate gradients with the cosine preconditioner; with a direct factor where weights jump too much for that.
 
     The factor costs as much as `_PATIENCE` steps (measured from 128^2 to 512^2), so at worst half of the work is lost.
+    Anchors that are firm are met by the start, so that residuals are measured by what they leave open.
     """
-    b = gauge.remove(gauge.remove(b))  # again: a mean left by rounding lies outside the range of H
-    z0 = None if z0 is None else gauge.remove(z0)  # what it says of free constants is not for CG to mend
-    anchors = _Anchors.of(w, r, gauge, setting)
-    scale = None
-    if anchors is not None:
-        start = anchors.start(b)
-        scale = (b - anchors.apply(start)).flatten(1).norm(dim=1)
-        z0 = start if z0 is None else anchors.shift(z0, b)
+    b = gauge.balance(gauge.balance(b))  # again: a mean left by rounding lies outside the range of H
+    if gauge.share.shape[1] == 0:  # every live pixel is held; the adjoint may ask for a height of the others too
+        b = torch.where(edge_ends(w) + r > 0, b, 0)
+    unit = None
+    if gauge.labels.shape[1]:
+        (b, w, r), unit = _components_in_units(b, w, r, gauge, setting)
+        z0 = None if z0 is None else z0 / unit
+    apply, start = _normal(w, r, setting), None
+    if gauge.pull.shape[1]:
+        diagonal = edge_ends(w / _squares(w, setting)) + r
+        firm = 2 * r > diagonal
+        start = torch.where(firm, b / torch.where(firm, diagonal, 1), 0)
+        b = gauge.balance(b - apply(start))
+        z0 = None if z0 is None else z0 - start
+    z0 = None if z0 is None else gauge.settle(z0)  # what it says of free constants is not for CG to mend
     patience = _PATIENCE if b[0].numel() * b.shape[0] <= _LARGEST else setting.max_iter
     found = conjugate_gradients(
-        _normal(w, r, setting), preconditioner(w, r, setting.pixel_size), b, z0,
-        tol=setting.tol, max_iter=min(patience, setting.max_iter), project=gauge.correction(), scale=scale,
+        apply, preconditioner(w, r, setting.pixel_size, weak=start is not None), b, z0,
+        tol=setting.tol, max_iter=min(patience, setting.max_iter), project=gauge.correction(),
+        deflate=gauge.deflation(),
     )  # fmt: skip
     if not bool(found.converged.all()) and patience < setting.max_iter:
         rest = (~found.converged).nonzero()[:, 0]
-        scale = None if scale is None else scale[rest].double()
-        direct = _directly(b[rest], w[rest], r[rest], found.x[rest], gauge.select(rest), setting, scale)
-        found = found.replace(rest, direct)
-    return found if anchors is None else found._replace(x=anchors.shift(found.x, b))
+        found = found.replace(rest, _directly(b[rest], w[rest], r[rest], found.x[rest], gauge.select(rest), setting))
+    x = found.x if start is None else found.x + start
+    x = gauge.settle(x)
+    return found._replace(x=x if unit is None else x * unit)
 
 
-class _Anchors(NamedTuple):
-    r"""What anchors on some of the pixels demand of a solve: firm or far from 0, they drown the residuals of the rest.
+def _components_in_units(
+    b: Tensor, w: Tensor, r: Tensor, gauge: Gauge, setting: _Setting
+) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+    """Weights and residuals of order 1 on every component, and the unit (N, 1, H, W) of its heights.
 
-    So residuals are measured against those of a start that the anchors alone suggest, and the constant c of every
-    component that they hold is found from the sum of its equations, \sum_i r_i (z_i + c) = \sum_i b_i.
+    Components do not touch, so each has a scale of its own; with one scale, the tolerance of the largest would swallow
+    the others.
     """
-
-    labels: Tensor
-    r: Tensor
-    diagonal: Tensor
-    apply: LinearMap
-
-    @classmethod
-    def of(cls, w: Tensor, r: Tensor, gauge: Gauge, setting: _Setting) -> _Anchors | None:
-        """None without anchors, or where they are on every pixel and so leave nothing to swallow."""
-        scale = torch.tensor(setting.pixel_size, dtype=w.dtype, device=w.device).view(1, 2, 1, 1)
-        edges = edge_ends(w / scale.square())
-        some = gauge.labels.shape[1] > 0 and bool((r > 0).any())
-        if not some or bool(((r > 0) | (edges == 0)).all()):
-            return None
-        return cls(gauge.labels, r, edges + r, _normal(w, r, setting))
-
-    def shift(self, z: Tensor, b: Tensor) -> Tensor:
-        """The height with the constants that its equations ask for."""
-        rest, trust = ((t.double().flatten(1)) for t in (b - self.apply(z), self.r))
-        sums, weights = (torch.zeros_like(t).scatter_add(1, self.labels, t) for t in (rest, trust))
-        c = torch.where(weights > 0, sums / torch.where(weights > 0, weights, 1), 0)
-        return z + c.gather(1, self.labels).view_as(z).to(z.dtype)
-
-    def start(self, b: Tensor) -> Tensor:
-        """The constants of the anchors, and firm anchors where they want to be."""
-        z = self.shift(torch.zeros_like(b), b)
-        firm = 2 * self.r > self.diagonal
-        return z + torch.where(firm, (b - self.apply(z)) / torch.where(firm, self.diagonal, 1), 0)
+    stiffness = edge_ends(w / _squares(w, setting)) + r
+    trust = unit_of(gauge.largest(stiffness.flatten(1))).view_as(r)
+    w, r, b = w / trust, r / trust, b / trust
+    largest = unit_of(gauge.largest(b.abs().flatten(1)))
+    norm = unit_of(gauge.sums((b.flatten(1) / largest).square()).sqrt())
+    unit = (largest * norm).view_as(b)
+    return (b / unit, w, r), unit
 
 
-def _directly(
-    b: Tensor, w: Tensor, r: Tensor, x: Tensor, gauge: Gauge, setting: _Setting, norm: Tensor | None
-) -> CGResult:
+def _directly(b: Tensor, w: Tensor, r: Tensor, x: Tensor, gauge: Gauge, setting: _Setting) -> CGResult:
     """The same, preconditioned by a direct factor and in double precision; one step mostly, three where H is singular.
 
-    In the factor alone, one pixel of every free component is held by as much as its edges weigh.
+    In the factor alone, one pixel of every component that nothing else holds is held by as much as its edges weigh.
     """
     dtype, gauge = b.dtype, gauge.double()
     b, w, r, x = (t.double() for t in (b, w, r, x))
-    scale = torch.tensor(setting.pixel_size, dtype=w.dtype, device=w.device).view(1, 2, 1, 1)
-    held = r + torch.where(gauge.pins().view_as(r), edge_ends(w / scale.square()), 0)
+    edges = edge_ends(w / _squares(w, setting))
+    held = r
+    if gauge.share.shape[1]:
+        loose = gauge.pins().view_as(r)
+        if gauge.pull.shape[1]:
+            loose = loose & (gauge.sums(r.flatten(1)).view_as(r) < _WEAK * edges)
+        held = r + torch.where(loose, edges, 0)
     direct = factor(w, held, setting.pixel_size)
     found = conjugate_gradients(
-        _normal(w, r, setting), lambda y: gauge.remove(direct.solve(y)), gauge.remove(b), x,
-        tol=setting.tol, max_iter=_DIRECT_STEPS, project=gauge.correction(), scale=norm,
+        _normal(w, r, setting), lambda y: gauge.settle(direct.solve(y)), gauge.balance(b), x,
+        tol=setting.tol, max_iter=_DIRECT_STEPS, project=gauge.correction(), deflate=gauge.deflation(),
+        scale=b.flatten(1).norm(dim=1),
     )  # fmt: skip
     return found._replace(x=found.x.to(dtype), residual=found.residual.to(dtype))
+
+
+def _squares(like: Tensor, setting: _Setting) -> Tensor:
+    return torch.tensor(setting.pixel_size, dtype=like.dtype, device=like.device).view(1, 2, 1, 1).square()
 
 
 def fold_vmap(size: int, in_dims: tuple[int | None, ...], inputs: tuple[Any, ...]) -> list[Any]:
@@ -319,15 +424,20 @@ def fold_vmap(size: int, in_dims: tuple[int | None, ...], inputs: tuple[Any, ...
     return [fold(x, d) for x, d in zip(inputs, in_dims, strict=True)]
 
 
-def _live_window(w: Tensor, r: Tensor) -> tuple[slice, slice]:
-    """The smallest rectangle that holds all pixels with an edge or an anchor, on any surface of the batch."""
-    live = ((edge_ends(w) + r) > 0).any(0)[0]
-
-    def span(hit: Tensor) -> slice:
+def _live_window(alive: Tensor) -> Tensor:
+    """First and last row, first and last column (1, 4) of the smallest rectangle with all live pixels of the batch."""
+    alive = alive.any(0)[0]
+    ends = []
+    for hit in (alive.any(1), alive.any(0)):
         found = hit.nonzero()
-        return slice(int(found[0]), int(found[-1]) + 1) if len(found) else slice(0, 1)
+        ends += [int(found[0]), int(found[-1])] if len(found) else [0, 0]
+    return torch.tensor([ends], device=alive.device)
 
-    return span(live.any(1)), span(live.any(0))
+
+def _slices(bounds: Tensor) -> tuple[slice, slice]:
+    """The window of the whole batch."""
+    top, bottom, left, right = bounds[0].tolist()
+    return slice(top, bottom + 1), slice(left, right + 1)
 
 
 def _warn(residual: Tensor, converged: Tensor, setting: _Setting) -> None:
@@ -335,7 +445,7 @@ def _warn(residual: Tensor, converged: Tensor, setting: _Setting) -> None:
         f"solve: {int((~converged).sum())} of {len(converged)} surfaces stopped after {setting.max_iter} iterations "
         f"at a relative residual of up to {float(residual.max()):.1e}, above tol={setting.tol:.1e}",
         ConvergenceWarning,
-        stacklevel=5,  # the caller of `solve`
+        stacklevel=6,  # the caller of `solve`
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -18,7 +20,7 @@ _FIRM = 0.25
 _SMOOTH = 16
 
 
-def preconditioner(w: Tensor, r: Tensor, pixel_size: tuple[float, float]) -> LinearMap:
+def preconditioner(w: Tensor, r: Tensor, pixel_size: tuple[float, float], weak: bool = False) -> LinearMap:
     r"""The map b -> S (A^T A + rho)^{-1} S b: a direct solve between two diagonal scalings.
 
     With d the weight of the edges around a pixel (see `_local_weight`) and k = 2/dx^2 + 2/dy^2 the diagonal of A^T A,
@@ -28,6 +30,8 @@ def preconditioner(w: Tensor, r: Tensor, pixel_size: tuple[float, float]) -> Lin
     anchor) have s = 0.
     All of it runs in single precision, at half the cost: it need only be close to the inverse.
 
+    With `weak`, the constants of components are no concern: rho is then 0 or at least a part of the least eigenvalue,
+    as anchors of next to no weight would make the constant drown the rest.
     Where the anchors hold every surface firmly the diagonal alone does nearly as well, and costs a tenth.
     """
     k = sum(2 / d**2 for d in pixel_size)
@@ -38,6 +42,9 @@ def preconditioner(w: Tensor, r: Tensor, pixel_size: tuple[float, float]) -> Lin
     q = torch.where(alive, r / total, 0).sum((-2, -1), keepdim=True) / n_alive
     rest = torch.where(alive, 1 - r / total, 0).sum((-2, -1), keepdim=True) / n_alive
     rho = k * q / rest.clamp(min=1e-6)
+    if weak:
+        least = min((math.pi / n / d) ** 2 for n, d in zip(w.shape[:-3:-1], pixel_size, strict=True))
+        rho = torch.where(rho > 0, rho.clamp(min=0.1 * least), 0)
     if bool((rho > _FIRM * k).all()):
         scale = torch.tensor(pixel_size, dtype=w.dtype, device=w.device).view(1, 2, 1, 1)
         diagonal = edge_ends(w / scale.square()) + r

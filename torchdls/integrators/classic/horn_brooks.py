@@ -73,13 +73,18 @@ class HornBrooks(Integrator):
         v, w = edge_slopes(g, mask, fields.weight)
         assert w is not None
         r = w.new_zeros(w.shape[0], 1, 1, 1) if fields.anchor_weight is None else fields.anchor_weight
-        b = a.adjoint(w * v) if fields.anchor is None else a.adjoint(w * v) + r * fields.anchor
+        gauge = free_constants(w.detach(), r.detach().expand(len(w), 1, *w.shape[2:]))
+        b, level = a.adjoint(w * v), torch.zeros_like(w[:, :1])
+        if fields.anchor is not None:  # less its constant, which sweeps would take for ever to find
+            level = gauge.constants(r * fields.anchor, r.expand_as(level))
+            b = b + r * (fields.anchor - level)
         diagonal = edge_ends(w / w.new_tensor(fields.steps).square().view(1, 2, 1, 1)) + r
         step = self.relaxation / torch.where(diagonal > 0, diagonal, 1)
         i, j = (torch.arange(n, device=b.device) for n in b.shape[-2:])
         colour = (i[:, None] + j) % 2 == 0
-        goal = self.tol * b.detach().flatten(1).norm(dim=1)
-        z, active = torch.zeros_like(b), torch.ones_like(goal, dtype=torch.bool)
+        z = torch.where(2 * r > diagonal, b / torch.where(diagonal > 0, diagonal, 1), 0)  # firm anchors, met at once
+        goal = self.tol * (b - a.adjoint(w * a(z)) - r * z).detach().flatten(1).norm(dim=1)
+        active = torch.ones_like(goal, dtype=torch.bool)
         sweeps = torch.zeros_like(goal, dtype=torch.int64)
         for _ in range(self.max_iter):
             residual = b - a.adjoint(w * a(z)) - r * z
@@ -94,5 +99,4 @@ class HornBrooks(Integrator):
         else:
             message = f"HornBrooks: {int(active.sum())} of {len(b)} surfaces above tol={self.tol:g}"
             warnings.warn(f"{message} after {self.max_iter} iterations", ConvergenceWarning, stacklevel=2)
-        height = free_constants(w.detach(), r.expand_as(z).detach()).remove(z)
-        return IntegrationResult(height, sweeps, ~active)
+        return IntegrationResult(gauge.settle(z) + level, sweeps, ~active)
