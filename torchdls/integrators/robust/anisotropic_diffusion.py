@@ -145,19 +145,26 @@ class AnisotropicDiffusion(Robust):
         v, w = tensors.majoriser(z)
         step = self._surface(fields, v, w, fields.anchor_weight, z) - z
         slopes = GradientOperator("forward", fields.steps)
-        fall = (w * slopes(step).square()).sum((-3, -2, -1)) + _anchored(fields, step)
-        fall = fall[:, None, None, None]
-        some = before > 0
+
+        def fall_along(d: Tensor) -> Tensor:
+            """What the objective loses, to first order, by a move along d."""
+            fall = (w * slopes(step) * slopes(d)).sum((-3, -2, -1)) + _anchored(fields, step, d)
+            return fall[:, None, None, None]
+
+        fall, some = fall_along(step), before > 0
         direction = step + torch.where(some, fall / torch.where(some, before, 1), 0) * direction
-        rise = 2 * tensors.energy(tensors.terms.difference(direction)) + _anchored(fields, direction)
+        along = fall_along(direction)  # the same, until rounding is all that is left of the steps: begin anew then
+        conjugate = (along - fall).abs() <= 0.5 * fall
+        direction, along = torch.where(conjugate, direction, step), torch.where(conjugate, along, fall)
+        rise = 2 * tensors.energy(tensors.terms.difference(direction)) + _anchored(fields, direction, direction)
         rise = rise[:, None, None, None]
         steep = rise > 0
-        return z + torch.where(steep, fall / torch.where(steep, rise, 1), 0) * direction, direction, fall
+        return z + torch.where(steep, along / torch.where(steep, rise, 1), 0) * direction, direction, fall
 
 
-def _anchored(fields: Fields, z: Tensor) -> Tensor | float:
-    """(N,) sum of r z^2."""
-    return 0.0 if fields.anchor_weight is None else (fields.anchor_weight * z.square()).sum((-3, -2, -1))
+def _anchored(fields: Fields, y: Tensor, z: Tensor) -> Tensor | float:
+    """(N,) sum of r y z."""
+    return 0.0 if fields.anchor_weight is None else (fields.anchor_weight * y * z).sum((-3, -2, -1))
 
 
 def _blurred(x: Tensor) -> Tensor:

@@ -75,13 +75,16 @@ class WeightedLeastSquares(LeastSquares):
         """Slopes v and trusts q w; they do not depend on z."""
         v, w = edge_slopes(fields.gradient, fields.mask, fields.weight)
         w = present(v) if w is None else w
-        return v, w * self._trust(fields, w)
+        return v, w * self._trust(fields)
 
-    def _trust(self, fields: Fields, w: Tensor) -> Tensor:
+    def _trust(self, fields: Fields) -> Tensor:
         """(N, 2, H, W), q."""
+        g = fields.gradient
+        valid = torch.ones_like(g, dtype=torch.bool) if fields.weight is None else (fields.weight > 0).expand_as(g)
+        valid = valid if fields.mask is None else valid & fields.mask
         curl, cells = curl_of(fields)
         noise = masked_median(curl.abs().flatten(1), cells.flatten(1)) / NORMAL_MEDIAN
-        kappa = self.threshold * torch.maximum(noise, least_slope(fields.gradient, w > 0))
+        kappa = self.threshold * torch.maximum(noise, least_slope(g, valid))
         badness = torch.where(cells, (curl / kappa[:, None, None]).square(), 0)
         number = _beside(cells.to(curl.dtype)).clamp(min=1)
         return (1 + _beside(badness) / number).square().reciprocal() + self.floor

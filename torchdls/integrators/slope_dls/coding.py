@@ -114,18 +114,22 @@ class SlopeScale:
         """One sweep over codes and atoms of both components together, in units of the noise; returns D and B too.
 
         The codes must go on from those of the last sweep (B None is a start from 0): learned atoms are not orthogonal,
-        and a start from 0 each time shrinks what they say together.
+        and a start from 0 each time shrinks what they say together. Patches without noise are their own estimate: atoms
+        learned from what rounding leaves of a plane would have no derivative.
         """
         level = self.level(noise).mean(1)
         P = self.extract(slopes)
         scale = torch.where(level > 0, level, 1)
         covariance = slope_covariance(self.size, slopes, self.steps)
         threshold = tau * ((covariance @ D.detach()) * D.detach()).sum(1).clamp(min=0).sqrt()
-        threshold = torch.where(level[:, :, 0] > 0, threshold, 0)
+        noisy = level > 0
         B = P.new_zeros(P.shape[0], D.shape[-1], P.shape[-1]) if B is None else B / scale
-        D, B = soup_dil_sweep(P.flatten(1, 2) / scale, D, B, threshold, order="block", unused="keep")
+        flat = P.flatten(1, 2)
+        noisy_patches = torch.where(noisy, flat / scale, 0)
+        D, B = soup_dil_sweep(noisy_patches, D, B, threshold, order="block", unused="keep")
         B = B * scale
-        return Coded(self.fold((D @ B).view_as(P), slopes.shape), self.coverage(slopes)), D, B
+        estimate = torch.where(noisy, D @ B, flat)
+        return Coded(self.fold(estimate.view_as(P), slopes.shape), self.coverage(slopes)), D, B
 
     def initial_dictionary(self, slopes: Tensor) -> Tensor:
         """(N, 2n, 2n): cosines of the slopes in x and, separately, in y."""
