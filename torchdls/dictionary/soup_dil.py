@@ -105,7 +105,7 @@ def residual_sweep(
     into the set that atoms are chosen from, before it is normalised.
 
     Returns:
-        R, D and B after the sweep. Where no derivative is is_recorded, R and B are overwritten: no second copy is made.
+        R, D and B after the sweep. Where no derivative is recorded, R and B are overwritten: no second copy is made.
     """
     in_place = not is_recorded(R, D, B, *([mu] if isinstance(mu, Tensor) else []))
     rule = _Rule(_levels(mu, B, in_place), bound, threshold, unused, in_place, project)

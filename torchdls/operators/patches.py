@@ -100,7 +100,7 @@ class Patches:
         return self._scatter(x, size) if torch.compiler.is_compiling() else _Adjoint.apply(x, self, size)
 
     def extract_onto(self, x: Tensor, z: Tensor) -> Tensor:
-        """X + extract(z); where no derivative is is_recorded, x is overwritten and no copy of the patches is made."""
+        """X + extract(z); where no derivative is recorded, x is overwritten and no copy of the patches is made."""
         if is_recorded(x, z):
             return x + self.extract(z)
         self._gather(z, x)
