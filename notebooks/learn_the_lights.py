@@ -48,7 +48,7 @@ images = torchdls.render(normals, rotated(knock), snr_db=30, generator=torch.Gen
 
 # %%
 to_gradient = torchdls.NormalsToGradient()
-integrate = torchdls.DLS(learn="fixed", n_iter=5, tol=0.0, grad_tol=1e-2)
+integrate = torchdls.DLS(learn="fixed", n_iter=5, tol=0.0, derivative=torchdls.Implicit(1e-2))
 
 
 def surface_of(angles: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

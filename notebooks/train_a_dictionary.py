@@ -72,10 +72,7 @@ trained = torchdls.DLS(
     lam=nn.Parameter(torch.tensor(0.5)),
     mu=nn.Parameter(torch.tensor(1.0)),
     dictionary=nn.Parameter(dct.clone()),
-    learn="fixed",
-    threshold="firm",
-    grad="unroll",
-    order="block",
+    learner=torchdls.FixedDictionary(threshold="firm"),
     n_iter=ITERATIONS,
     tol=0.0,
 )
@@ -117,8 +114,7 @@ print(f"lam {trained.lam.item():.2f}, mu {trained.mu.item():.2f} times the noise
 rivals = {
     "cosine dictionary": torchdls.DLS(learn="fixed", n_iter=ITERATIONS, tol=0.0),
     "cosines, trained lam and mu": torchdls.DLS(
-        learn="fixed",
-        threshold="firm",
+        learner=torchdls.FixedDictionary(threshold="firm"),
         n_iter=ITERATIONS,
         tol=0.0,
         lam=trained.lam.detach(),

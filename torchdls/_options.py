@@ -62,7 +62,10 @@ def same(a: Any, b: Any) -> bool:
 
 
 def shown(value: Any) -> str:
-    """The value of an option in a few words: of a tensor with more than one number, the shape."""
+    """The value of an option in a few words: of a tensor the shape, of a part what differs from its defaults."""
+    if is_dataclass(value) and not isinstance(value, type):
+        told = {f.name: v for f in fields(value) if (v := getattr(value, f.name)) != f.default}
+        return f"{type(value).__name__}({', '.join(f'{name}={shown(v)}' for name, v in told.items())})"
     if not isinstance(value, Tensor):
         return repr(value)
     content = f"{value.item():g}" if value.numel() == 1 else "x".join(map(str, value.shape))

@@ -42,7 +42,7 @@ def build(name: str, /, **options: Any) -> Integrator:
 
     Example:
         >>> torchdls.build("dls", learner={"name": "k_svd", "n_nonzero": 4}, n_iter=10)
-        DLS(n_iter=10, learner=KSVD(n_nonzero=4, steps=1))
+        DLS(n_iter=10, learner=KSVD(n_nonzero=4))
     """
     return _make_integrator(name, options, None)
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.common.report import markdown_table, results_folder, write_json
-from torchdls import DLS, SURFACES, LeastSquares, add_noise
+from torchdls import DLS, SURFACES, LeastSquares, Proximal, SoupDIL, add_noise
 from torchdls.metrics import mean_angular_error, rmse, ssim
 from torchdls.noise import noise_sigma
 
@@ -37,13 +37,13 @@ PAPER = {
 SWEEP = (1.0, 1.25, 1.5, 2.0, 2.5, 3.5, 5.0)  # thresholds mu, in units of the noise of one gradient sample
 TRIALS: dict[str, dict[str, Any]] = {
     "paper's set-up (reference)": {},
-    "block order": {"order": "block"},
-    "2 sweeps per iteration": {"n_sweeps": 2},
-    "4 sweeps per iteration": {"n_sweeps": 4},
-    "proximal z-step, 1 step": {"z_step": "proximal"},
-    "proximal z-step, 3 steps": {"z_step": "proximal", "n_prox": 3},
-    "proximal z-step, 10 steps": {"z_step": "proximal", "n_prox": 10},
-    "unused atoms kept": {"unused": "keep"},
+    "block order": {"learner": SoupDIL("block")},
+    "2 sweeps per iteration": {"learner": SoupDIL(n_sweeps=2)},
+    "4 sweeps per iteration": {"learner": SoupDIL(n_sweeps=4)},
+    "proximal z-step, 1 step": {"height_step": Proximal()},
+    "proximal z-step, 3 steps": {"height_step": Proximal(3)},
+    "proximal z-step, 10 steps": {"height_step": Proximal(10)},
+    "unused atoms kept": {"learner": SoupDIL(unused="keep")},
     "stride 1": {"stride": 1},
     "stride 4": {"stride": 4},
     "lam = 0.1": {"lam": 0.1},

@@ -37,6 +37,7 @@ from torchdls import (
     HarkerOLeary,
     LeastSquares,
     Patches,
+    SoupDIL,
     add_noise,
     dct_dictionary,
     gradient_to_normals,
@@ -129,7 +130,7 @@ def harker_oleary(size: int) -> Case:
 
 def sweep(size: int, order: Order, target: float) -> Case:
     """One sweep in the middle of DLS, where codes are sparse, as DLS runs it: from the residual, in place."""
-    result = DLS(order=order, n_iter=4, tol=0.0).solve(noisy(size, torch.float32))
+    result = DLS(learner=SoupDIL(order), n_iter=4, tol=0.0).solve(noisy(size, torch.float32))
     D, B, mu = result.dictionary, result.codes, result.mu[:, None]
     R = (Patches().extract(result.height).mT - B.mT @ D.mT).mT
     product = torch.empty_like(B)
@@ -142,11 +143,11 @@ def sweep(size: int, order: Order, target: float) -> Case:
 
 def iteration(size: int, order: Order, target: float) -> Case:
     """A whole iteration of DLS (sweep, height, objective); the product is timed between iterations."""
-    g, dls = noisy(size, torch.float32), DLS(order=order, n_iter=200, tol=0.0)
+    g, dls = noisy(size, torch.float32), DLS(learner=SoupDIL(order), n_iter=200, tol=0.0)
     result = DLS(n_iter=1).solve(g)
     D, B, product = result.dictionary, result.codes, torch.empty_like(result.codes)
     candidates: dict[str, Run] = {
-        "DLS iteration": lambda: DLS(order=order, n_iter=2, tol=0.0)(g),
+        "DLS iteration": lambda: DLS(learner=SoupDIL(order), n_iter=2, tol=0.0)(g),
         "floor: product": lambda: torch.bmm(D.mT, B, out=product),
     }
 

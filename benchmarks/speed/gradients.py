@@ -18,7 +18,7 @@ import torch
 
 from benchmarks.common.report import markdown_table, results_folder, write_json
 from benchmarks.common.timing import fresh_process, interleaved, peak_megabytes
-from torchdls import DLS, SURFACES, LeastSquares, add_noise
+from torchdls import DLS, SURFACES, LeastSquares, SoupDIL, Unroll, add_noise
 
 # glibc keeps freed blocks below a moving threshold; a low one makes the resident size follow what is in use.
 MALLOC = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
@@ -38,14 +38,20 @@ def cases(size: int) -> dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], 
     """Integrator, what is compared with its plain forward, the target, and the side of the field."""
     mask, least_squares = disk(2 * size), LeastSquares()
     fixed = DLS(n_iter=20, tol=0.0, learn="fixed")
-    atom, block = (DLS(n_iter=10, tol=0.0, order=order) for order in ("atom", "block"))
+    saving = DLS(n_iter=10, tol=0.0, derivative=Unroll(checkpoint=True))
+    atom, block = (DLS(n_iter=10, tol=0.0, learner=SoupDIL(order)) for order in ("atom", "block"))
     return {
         "least squares": (least_squares, "backward", 1.2, 4 * size),
         "least squares, mask": (lambda g: least_squares(g, mask), "backward", 1.2, 2 * size),
         "DLS implicit, 20 iterations": (fixed, "backward", 1.0, size),
         "DLS unrolled, paper's order": (atom, "both", 8.0, size),
         "DLS unrolled, block order": (block, "both", 8.0, size),
-        "DLS unrolled, checkpoint": (DLS(n_iter=10, tol=0.0, checkpoint=True), "both", float("nan"), size),
+        "DLS unrolled, checkpoint": (
+            saving,
+            "both",
+            float("nan"),
+            size,
+        ),
     }
 
 
@@ -72,7 +78,7 @@ def time_case(run: Callable[[torch.Tensor], torch.Tensor], what: str, g: torch.T
 MODES: dict[str, dict[str, Any]] = {
     "plain": {},
     "unroll": {},
-    "checkpoint": {"checkpoint": True},
+    "checkpoint": {"derivative": Unroll(checkpoint=True)},
     "fixed plain": {"learn": "fixed"},
     "implicit": {"learn": "fixed"},
 }
@@ -86,7 +92,7 @@ def peak(mode: str, size: int, iterations: int) -> float:
     z = DLS(n_iter=2)(part)
     torch.autograd.grad(z, part, torch.ones_like(z))  # the first call of it imports SymPy, 33 MB
     before = peak_megabytes()
-    model = DLS(n_iter=iterations, tol=0.0, order="block", **MODES[mode])
+    model = DLS(n_iter=iterations, tol=0.0, learner=SoupDIL("block"), **MODES[mode])
     if "plain" in mode:
         with torch.no_grad():
             model(g)

@@ -176,14 +176,16 @@ def test_perspective_plane_comes_back_as_depth(tmp_path, as_file):
 def test_dls_with_options_and_a_progress_bar(tmp_path, gradient_file, capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     out = str(tmp_path / "z.npy")
-    options = ["--set", "n_iter=3", "--set", "tol=0", "--set", "z_step=proximal"]
+    options = ["--set", "n_iter=3", "--set", "tol=0", "--set", "height_step=proximal"]
     assert main(["integrate", str(gradient_file), "--method", "dls", *options, "-o", out]) == 0
     captured = capsys.readouterr()
     assert "objective" in captured.err
     assert "3/3" in captured.err
     from torchdls import DLS
 
-    torch.testing.assert_close(io.load_height(out).height, DLS(n_iter=3, tol=0, z_step="proximal")(surface().gradient))
+    torch.testing.assert_close(
+        io.load_height(out).height, DLS(n_iter=3, tol=0, height_step="proximal")(surface().gradient)
+    )
 
 
 def test_a_stored_mask_and_that_of_the_option_both_count(tmp_path):

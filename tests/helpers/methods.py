@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tests.helpers.fields import MASKS, random_field, uniform_field
-from torchdls import INTEGRATORS, Integrator, LeastSquares
+from torchdls import INTEGRATORS, Exact, Integrator, LeastSquares, Proximal, SoupDIL
 from torchdls.integrators.robust import Robust
 
 Options = dict[str, Any]
@@ -46,7 +46,7 @@ SPLITTING = {"reweighting_never_raises_the_objective": "it does not reweigh: ADM
 TIGHT = {"tol": 1e-13}
 FEW: Options = {"n_iter": 2, "tol": 0.0, "solve_tol": 1e-13}
 DLS_EXACT: Options = {
-    "patch_size": 3, "n_atoms": 9, "lam": 0.4, "mu": 0.35, "n_iter": 2, "tol": 0.0, "z_tol": 1e-13,
+    "patch_size": 3, "n_atoms": 9, "lam": 0.4, "mu": 0.35, "n_iter": 2, "tol": 0.0, "height_step": Exact(1e-13),
     "data_term": LeastSquares(**TIGHT),
 }  # fmt: skip
 SLOPE_DLS_EXACT: Options = {"recipe": "plain", "patch_sizes": (3, 5), "tau": 0.8, "n_iter": 2, "z_tol": 1e-13}
@@ -105,22 +105,30 @@ METHODS: dict[str, Method] = {
         {"n_iter": 5, "floor": 0.1}, tol=1e-3, no=ONE_SCALE, exact={"default": {"floor": 0.1, **FEW}}
     ),
     "dls": Method(
-        {"patch_size": 4, "stride": 2, "n_atoms": 16, "mu": 0.3, "n_iter": 3, "tol": 0.0, "unused": "keep"},
+        {
+            "patch_size": 4,
+            "stride": 2,
+            "n_atoms": 16,
+            "mu": 0.3,
+            "n_iter": 3,
+            "tol": 0.0,
+            "learner": SoupDIL(unused="keep"),
+        },
         tol=1e-4,
         smallest=4,
         no={
             **ONE_DICTIONARY,
-            "plane_is_exact": "codes below mu are lost; it holds for mu='auto' and order='block' (see test_dls.py)",
+            "plane_is_exact": "codes below mu are lost; it holds for mu='auto' and the block order (see test_dls.py)",
             "scales_with_the_slopes": "mu is a fixed height; with mu='auto' it holds (tested in test_dls.py)",
         },
         exact={
             "default": DLS_EXACT,
-            "block": {**DLS_EXACT, "order": "block", "n_sweeps": 2, "bound": 3.0},
+            "block": {**DLS_EXACT, "learner": SoupDIL("block", n_sweeps=2, bound=3.0)},
             "shared": {**DLS_EXACT, "learn": "shared", "pixel_size": (0.5, 1.5)},
-            "proximal": {**DLS_EXACT, "z_step": "proximal", "n_prox": 2},
-            "soft": {**DLS_EXACT, "threshold": "soft", "mu": "auto"},
-            "firm": {**DLS_EXACT, "threshold": "firm", "order": "block"},
-            "fixed": {**DLS_EXACT, "learn": "fixed", "grad": "unroll"},
+            "proximal": {**DLS_EXACT, "height_step": Proximal(2)},
+            "soft": {**DLS_EXACT, "learner": SoupDIL(threshold="soft"), "mu": "auto"},
+            "firm": {**DLS_EXACT, "learner": SoupDIL("block", threshold="firm")},
+            "fixed": {**DLS_EXACT, "learn": "fixed", "derivative": "unroll"},
         },
     ),
     "slope_dls": Method(

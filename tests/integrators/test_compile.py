@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.helpers import random_field
-from torchdls import DLS, LeastSquares
+from torchdls import DLS, LeastSquares, SoupDIL
 
 pytestmark = [
     pytest.mark.slow,
@@ -14,7 +14,7 @@ pytestmark = [
 
 @pytest.mark.parametrize(
     "integrator",
-    [LeastSquares(), DLS(4, 2, 9, mu=0.3, n_iter=1, tol=0.0, z_step="proximal", order="block")],
+    [LeastSquares(), DLS(4, 2, 9, mu=0.3, n_iter=1, tol=0.0, height_step="proximal", learner=SoupDIL("block"))],
     ids=["least_squares", "dls"],
 )
 def test_compiled_equals_eager(integrator):

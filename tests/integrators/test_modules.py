@@ -13,7 +13,7 @@ from torch.nn.utils import parametrize
 
 from tests.helpers import random_field
 from tests.helpers.methods import method
-from torchdls import DLS, INTEGRATORS, LeastSquares, NormalsToGradient, soup_dil_sweep
+from torchdls import DLS, INTEGRATORS, LeastSquares, NormalsToGradient, SoupDIL, Unroll, soup_dil_sweep
 
 SMALL: dict[str, Any] = {"patch_size": 4, "n_atoms": 16, "n_iter": 3, "tol": 0.0}
 quiet = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
@@ -23,7 +23,7 @@ def dls(**options) -> DLS:
     """A small DLS with everything that can be trained as a parameter."""
     atoms = nn.Parameter(torch.eye(16) + 0.1 * random_field(16, 16, dtype=torch.float32))
     trained = {"lam": nn.Parameter(torch.tensor(0.4)), "mu": nn.Parameter(torch.tensor(0.3)), "dictionary": atoms}
-    return DLS(**{**SMALL, **trained, "threshold": "firm", **options})
+    return DLS(**{**SMALL, **trained, "learner": SoupDIL(threshold="firm"), **options})
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)
@@ -77,7 +77,7 @@ def test_training_lowers_the_loss(threshold: str, learn: str) -> None:
     truth = (row.square()[:, None] + row.sin())[None, None]
     slopes = torch.cat([truth.diff(dim=-1, append=truth[..., -1:]), truth.diff(dim=-2, append=truth[..., -1:, :])], 1)
     noisy = slopes + 0.2 * random_field(2, 2, 16, 16, dtype=torch.float32)
-    model = dls(threshold=threshold, learn=learn, grad="unroll")
+    model = dls(learner=SoupDIL(threshold=threshold), learn=learn, derivative="unroll")
     for name in ("lam", "mu"):
         parametrize.register_parametrization(model, name, Positive())
     optimiser, losses = torch.optim.Adam(model.parameters(), 0.02), []
@@ -99,7 +99,14 @@ def test_hard_threshold_gives_mu_no_derivative() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{}, {"learn": "fixed"}, {"threshold": "soft", "checkpoint": True}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"learner": SoupDIL("block")},
+        {"learner": "fixed"},
+        {"learner": SoupDIL("block", threshold="soft"), "derivative": Unroll(checkpoint=True)},
+    ],
+)
 def test_a_long_chain_stays_finite(options: dict) -> None:
     """Images to normals to gradients to DLS to a loss: batch 8, 128 x 128, with everything that makes NaN elsewhere."""
     lights = torch.tensor([[0.5, 0, 0.87], [-0.25, 0.43, 0.87], [-0.25, -0.43, 0.87], [0, 0, 1.0]])
@@ -112,8 +119,8 @@ def test_a_long_chain_stays_finite(options: dict) -> None:
     weight[3, :, 20:26, 20:26] = 0
     weight.requires_grad_()
     normals = torch.einsum("ck,nkhw->nchw", torch.linalg.pinv(lights), images)
-    n_atoms = 64 if "learn" in options else 100  # more atoms than the patches use
-    model = DLS(n_iter=2, tol=0.0, n_atoms=n_atoms, order="block", **options)
+    n_atoms = 64 if options["learner"] == "fixed" else 100  # more atoms than the patches use
+    model = DLS(n_iter=2, tol=0.0, n_atoms=n_atoms, **options)
     height = model(NormalsToGradient()(normals), weight=weight)
     height.square().mean().backward()
     assert height.isfinite().all()
@@ -144,7 +151,7 @@ def test_compiles_without_a_break() -> None:
         (LeastSquares(), (g,)),
         (lambda P, D, B: soup_dil_sweep(P, D, B, 0.5), (P, D, B)),
         (step, (g[:, :1], g.abs())),
-        (DLS(4, 2, 9, mu=0.3, n_iter=1, tol=0.0, z_step="proximal", order="block"), (g,)),
+        (DLS(4, 2, 9, mu=0.3, n_iter=1, tol=0.0, height_step="proximal", learner=SoupDIL("block")), (g,)),
     ]
     for function, arguments in cases:
         torch._dynamo.reset()
@@ -156,7 +163,7 @@ def test_compiles_without_a_break() -> None:
 @quiet
 @pytest.mark.parametrize(
     "module",
-    [LeastSquares(), DLS(4, 2, 9, mu=0.3, n_iter=2, tol=0.0, z_step="proximal", order="block")],
+    [LeastSquares(), DLS(4, 2, 9, mu=0.3, n_iter=2, tol=0.0, height_step="proximal", learner=SoupDIL("block"))],
     ids=["least_squares", "dls"],
 )
 def test_exports_for_a_fixed_shape(module: nn.Module) -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from torchdls import DLS, SURFACES, LeastSquares, Patches
+from torchdls import DLS, SURFACES, LeastSquares, Patches, SoupDIL
 from torchdls.dictionary.soup_dil import residual_sweep
 
 VIEWS = {"view", "slice", "select", "transpose", "expand", "unsqueeze", "as_strided", "detach", "split", "alias", "t"}
@@ -37,7 +37,7 @@ def noisy(size=96):
 
 
 def codes_of(order):
-    result = DLS(order=order, n_iter=2, tol=0.0).solve(noisy())
+    result = DLS(learner=SoupDIL(order), n_iter=2, tol=0.0).solve(noisy())
     P, D, B = Patches().extract(result.height), result.dictionary, result.codes
     return (P.mT - B.mT @ D.mT).mT, D, B
 
@@ -88,7 +88,7 @@ def test_a_batch_of_small_surfaces_is_not_swept_one_by_one(order):
     for n in (2, 8):
         g = noisy(40).expand(n, -1, -1, -1)
         with Operations(large=g.numel()) as seen:
-            DLS(order=order, n_iter=2, tol=0.0)(g)
+            DLS(learner=SoupDIL(order), n_iter=2, tol=0.0)(g)
         counts.append(seen.count.total())
     assert counts[1] < 1.05 * counts[0]
 
@@ -96,7 +96,7 @@ def test_a_batch_of_small_surfaces_is_not_swept_one_by_one(order):
 def test_iteration_of_dls_touches_the_patches_a_few_times():
     g, marks = noisy(), []
     with Operations(large=45 * 45 * 64) as seen:
-        DLS(order="block", n_iter=3, tol=0.0).solve(
+        DLS(learner=SoupDIL("block"), n_iter=3, tol=0.0).solve(
             g, callback=lambda *_: marks.append((seen.count.total(), seen.large.total()))
         )
     (count, large), (count_before, large_before) = marks[2], marks[1]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tests.helpers import uniform_field
 from tests.helpers.methods import bumps, everything, method
-from torchdls import DLS, INTEGRATORS, Integrator, LeastSquares, _registry
+from torchdls import DLS, INTEGRATORS, Integrator, LeastSquares, Unroll, _registry
 from torchdls.integrators import Fields
 from torchdls.integrators.robust import Robust
 from torchdls.operators import slope_divergence
@@ -46,7 +46,7 @@ def test_says_when_it_did_not_converge() -> None:
 def test_dls_counts_the_iterations_of_each_surface(checkpoint: bool) -> None:
     g = torch.cat([bumps(1, noise=0.3), 0.0 * bumps(1)])  # the second one has settled at once
     g = g.requires_grad_(checkpoint)
-    dls = DLS(patch_size=4, n_iter=6, tol=1e-2, mu=0.3, checkpoint=checkpoint)
+    dls = DLS(patch_size=4, n_iter=6, tol=1e-2, mu=0.3, derivative=Unroll(checkpoint))
     result = dls.solve(g)
     alone = [dls.solve(one[None]) for one in g]
     assert result.iterations.tolist() == [int(one.iterations) for one in alone]

@@ -64,7 +64,7 @@ def _word(value: Any) -> str:
 
 
 def _options(settings: Sequence[str]) -> dict[str, Any]:
-    """The values of words `name=value`: numbers, True, False, None, pairs, or plain words such as z_step=proximal."""
+    """The values of words `name=value`: numbers, True, False, None, tuples, or words such as learner=k_svd."""
     options: dict[str, Any] = {}
     for setting in settings:
         key, equals, value = setting.partition("=")

@@ -1,10 +1,11 @@
 r"""Dictionary learners behind one interface: each call is one pass over codes and atoms that never raises the cost.
 
-    ||P - D B||_F^2 + mu^2 ||B||_0,   ||d_i|| = 1,   |b_ji| <= bound
+    ||P - D B||_F^2 + mu^2 ||B||_0,   ||d_i|| = 1,   |b_ji| <= a
 
-A learner is called as learner(R, D, B, mu, bound=inf, learn=True) -> (R, D, B), with the residual R = P - D B
-(N, n, L), the dictionary D (N, n, K), or (1, n, K) shared by the batch, the codes B (N, K, L) and the threshold mu, a
-number or (N, 1). `learn=False` updates the codes alone. R and B may be overwritten where no derivative is recorded.
+A learner is called as learner(R, D, B, mu, learn=True) -> (R, D, B), with the residual R = P - D B (N, n, L), the
+dictionary D (N, n, K), or (1, n, K) shared by the batch, the codes B (N, K, L) and the threshold mu, a number or
+(N, 1). `learn=False` updates the codes alone. R and B may be overwritten where no derivative is recorded. Whoever needs
+to know what a learner minimises reads its `threshold` ("hard" if it has none) and its `bound` (none if it has none).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
-from torchdls.dictionary.thresholds import Threshold
+from torchdls.dictionary.thresholds import THRESHOLDS, Threshold
 
 Step = tuple[Tensor, Tensor, Tensor]
 
@@ -27,16 +28,14 @@ class Learner(Protocol):
     """What DLS asks of a learner; see the module.
 
     Example:
-        >>> def no_learner(R, D, B, mu, bound=float("inf"), learn=True):
+        >>> def no_learner(R, D, B, mu, learn=True):
         ...     return R, D, B  # codes stay 0
         >>> dls = torchdls.DLS(n_iter=2, learner=no_learner)
         >>> dls(torch.zeros(1, 2, 12, 12)).shape
         torch.Size([1, 1, 12, 12])
     """
 
-    def __call__(
-        self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
-    ) -> Step:
+    def __call__(self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, learn: bool = True) -> Step:
         """One pass: R, D and B after it."""
 
 
@@ -47,7 +46,12 @@ class SoupDIL:
     Args:
         order: "atom" (the paper's) or "block".
         unused: rule for atoms that no patch uses, "first" or "keep".
-        threshold: "hard", "soft" or "firm".
+        threshold: "hard", "soft" or "firm"; the last two have a derivative in mu.
+        bound: bound a on the codes, for heights in pixels.
+        n_sweeps: sweeps in one pass.
+
+    Raises:
+        ValueError: an option is unknown or out of range.
 
     Source: Ravishankar, Nadakuditi, Fessler, "Efficient sum of outer products dictionary learning (SOUP-DIL)", 2015.
 
@@ -61,19 +65,34 @@ class SoupDIL:
     order: Order = "atom"
     unused: Unused = "first"
     threshold: Threshold = "hard"
+    bound: float = math.inf
+    n_sweeps: int = 1
 
-    def __call__(
-        self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
-    ) -> Step:
-        """One sweep."""
-        return residual_sweep(R, D, B, mu, bound, self.order, unused=self.unused, learn=learn, threshold=self.threshold)
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def __call__(self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, learn: bool = True) -> Step:
+        """One pass of sweeps."""
+        for _ in range(self.n_sweeps):
+            R, D, B = residual_sweep(
+                R, D, B, mu, self.bound, self.order, unused=self.unused, learn=learn, threshold=self.threshold
+            )
+        return R, D, B
 
 
 @dataclass(frozen=True)
 class FixedDictionary:
     """The dictionary stays as it is (the cosine one, by default in DLS); only the codes follow, by thresholding.
 
-    Exact for orthonormal dictionaries; for others one pass of coordinate descent over the rows of codes.
+    Exact for orthonormal dictionaries; for others a pass of coordinate descent over the rows of codes.
+
+    Args:
+        threshold: "hard", "soft" or "firm"; the last two have a derivative in mu.
+        bound: bound a on the codes, for heights in pixels.
+        n_sweeps: times that each row is updated in one pass.
+
+    Raises:
+        ValueError: an option is unknown or out of range.
 
     Example:
         >>> D = torch.eye(4)[None]
@@ -82,11 +101,18 @@ class FixedDictionary:
         (True, 0.0)
     """
 
-    def __call__(
-        self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
-    ) -> Step:
+    threshold: Threshold = "hard"
+    bound: float = math.inf
+    n_sweeps: int = 1
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def __call__(self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, learn: bool = True) -> Step:
         """One pass over the codes, whatever `learn` says."""
-        return residual_sweep(R, D, B, mu, bound, "block", learn=False)
+        for _ in range(self.n_sweeps):
+            R, D, B = residual_sweep(R, D, B, mu, self.bound, "block", learn=False, threshold=self.threshold)
+        return R, D, B
 
 
 @dataclass(frozen=True)
@@ -102,6 +128,11 @@ class DinoKat:
         patch_size: rows and columns (c_y, c_x) of a patch; None for square patches.
         order: "atom" or "block".
         unused: rule for atoms that no patch uses, "first" or "keep".
+        bound: bound a on the codes, for heights in pixels.
+        n_sweeps: sweeps in one pass.
+
+    Raises:
+        ValueError: an option is unknown or out of range.
 
     Source: Ravishankar, Moore, Nadakuditi, Fessler, "Efficient learning of dictionaries with low-rank atoms", 2016.
 
@@ -116,16 +147,19 @@ class DinoKat:
     patch_size: tuple[int, int] | None = None
     order: Order = "atom"
     unused: Unused = "first"
+    bound: float = math.inf
+    n_sweeps: int = 1
 
     def __post_init__(self) -> None:
-        if not isinstance(self.rank, int) or self.rank < 1:
-            raise ValueError(f"DinoKat: rank={self.rank!r} given, an integer of at least 1 is needed")
+        check_options(self)
 
-    def __call__(
-        self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
-    ) -> Step:
-        """One sweep."""
-        return residual_sweep(R, D, B, mu, bound, self.order, unused=self.unused, learn=learn, project=self.project)
+    def __call__(self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, learn: bool = True) -> Step:
+        """One pass of sweeps."""
+        for _ in range(self.n_sweeps):
+            R, D, B = residual_sweep(
+                R, D, B, mu, self.bound, self.order, unused=self.unused, learn=learn, project=self.project
+            )
+        return R, D, B
 
     def project(self, h: Tensor) -> Tensor:
         """(N, n, 1), each of them cut to its largest singular values as a c_y x c_x matrix."""
@@ -155,6 +189,10 @@ class KSVD:
     Args:
         n_nonzero: most atoms of a patch; None leaves it to mu.
         steps: alternating products per atom, at least 1.
+        bound: bound a on the codes, for heights in pixels.
+
+    Raises:
+        ValueError: an option is out of range.
 
     Source: Aharon, Elad, Bruckstein, "K-SVD: an algorithm for designing overcomplete dictionaries for sparse
     representation", 2006; Rubinstein, Zibulevsky, Elad, 2008.
@@ -168,32 +206,29 @@ class KSVD:
 
     n_nonzero: int | None = None
     steps: int = 1
+    bound: float = math.inf
 
     def __post_init__(self) -> None:
-        for name, value in (("n_nonzero", self.n_nonzero or 1), ("steps", self.steps)):
-            if not isinstance(value, int) or value < 1:
-                raise ValueError(f"KSVD: {name}={value!r} given, an integer of at least 1 is needed")
+        check_options(self)
 
-    def __call__(
-        self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
-    ) -> Step:
+    def __call__(self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, learn: bool = True) -> Step:
         """One pass: pursuit, then atoms."""
         N, _, L = R.shape
         level = torch.as_tensor(mu, dtype=R.dtype, device=R.device).reshape(-1, 1).expand(N, L)
         P = R + D @ B
-        found = orthogonal_matching_pursuit(P, D, self.n_nonzero, mu=level).clamp(-bound, bound)
+        found = orthogonal_matching_pursuit(P, D, self.n_nonzero, mu=level).clamp(-self.bound, self.bound)
         rest = P - D @ found
         better = (_cost(rest, found, level) < _cost(R, B, level))[:, None]
         R, B = torch.where(better, rest, R), torch.where(better, found, B)
         if not learn:
             return R, D, B
         if D.shape[0] == N:
-            return self._atoms(R, D, B, bound)
+            return self._atoms(R, D, B)
         # One dictionary for all: the patches of the batch side by side are the patches of one surface.
-        R, D, B = self._atoms(R.transpose(0, 1).flatten(1)[None], D, B.transpose(0, 1).flatten(1)[None], bound)
+        R, D, B = self._atoms(R.transpose(0, 1).flatten(1)[None], D, B.transpose(0, 1).flatten(1)[None])
         return R[0].unflatten(1, (N, L)).transpose(0, 1), D, B[0].unflatten(1, (N, L)).transpose(0, 1)
 
-    def _atoms(self, R: Tensor, D: Tensor, B: Tensor, bound: float) -> Step:
+    def _atoms(self, R: Tensor, D: Tensor, B: Tensor) -> Step:
         atoms, rows = [], []
         for d, b in zip(D.split(1, -1), B.split(1, 1), strict=True):
             users = b != 0
@@ -201,12 +236,29 @@ class KSVD:
             old = d @ b
             for _ in range(self.steps):
                 d = _unit(E @ b.mT, d)
-                b = torch.where(users, (d.mT @ E).clamp(-bound, bound), 0)
+                b = torch.where(users, (d.mT @ E).clamp(-self.bound, self.bound), 0)
             R = R + old - d @ b
             atoms.append(d)
             rows.append(b)
         B = torch.cat(rows, 1)
         return R, _replace_unused(torch.cat(atoms, -1), R, B), B
+
+
+_WORDS = {"order": ("atom", "block"), "unused": ("first", "keep"), "threshold": THRESHOLDS}
+
+
+def check_options(learner: Learner) -> None:
+    """ValueError for a word that is unknown, or a number out of its range."""
+    name, options = type(learner).__name__, vars(learner)
+    for word, known in _WORDS.items():
+        if options.get(word, known[0]) not in known:
+            raise ValueError(f"{name}: {word}={options[word]!r} is unknown; choose from {', '.join(map(repr, known))}")
+    for count in ("rank", "n_nonzero", "steps", "n_sweeps"):
+        value = options.get(count)
+        if count in options and (count, value) != ("n_nonzero", None) and (not isinstance(value, int) or value < 1):
+            raise ValueError(f"{name}: {count}={value!r} given, an integer of at least 1 is needed")
+    if not options["bound"] > 0:
+        raise ValueError(f"{name}: bound={options['bound']!r} given, a positive number is needed")
 
 
 def _cost(R: Tensor, B: Tensor, level: Tensor) -> Tensor:

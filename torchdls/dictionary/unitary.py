@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchdls.dictionary.learners import Step, check_options
 from torchdls.dictionary.thresholds import Threshold, shrink
 
 
@@ -22,6 +23,10 @@ class Unitary:
 
     Args:
         threshold: "hard", "soft" or "firm".
+        bound: bound a on the codes, for heights in pixels.
+
+    Raises:
+        ValueError: an option is unknown or out of range, or (when called) the dictionary is not square.
 
     Source: Ravishankar, Bresler, "Closed-form solutions within sparsifying transform learning", ICASSP 2013; the
     orthogonal Procrustes problem: Schoenemann 1966.
@@ -34,10 +39,12 @@ class Unitary:
     """
 
     threshold: Threshold = "hard"
+    bound: float = math.inf
 
-    def __call__(
-        self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def __call__(self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, learn: bool = True) -> Step:
         """One pass: codes, then the dictionary."""
         n, K = D.shape[-2:]
         if n != K:
@@ -45,7 +52,7 @@ class Unitary:
         P = R + D @ B
         level = torch.as_tensor(mu, dtype=R.dtype, device=R.device)
         level = level[..., None] if level.ndim else level
-        B = shrink(D.mT @ P, level, bound, self.threshold)
+        B = shrink(D.mT @ P, level, self.bound, self.threshold)
         if learn:
             moment = P @ B.mT
             D = _nearest(moment if D.shape[0] == P.shape[0] else moment.sum(0, keepdim=True), D)

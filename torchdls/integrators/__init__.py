@@ -11,7 +11,7 @@ from torchdls.integrators.classic import (
     SpectralRegularization,
     TikhonovRegularization,
 )
-from torchdls.integrators.dls import DLS, DLSResult, dls_objective
+from torchdls.integrators.dls import DLS, DLSResult, Exact, Implicit, Proximal, Unroll, dls_objective
 from torchdls.integrators.robust import (
     L1,
     AnisotropicDiffusion,
@@ -37,18 +37,22 @@ __all__ = [
     "WeightedLeastSquares",
     "DLS",
     "DLSResult",
+    "Exact",
     "Fields",
     "FrankotChellappa",
     "HarkerOLeary",
     "HornBrooks",
     "INTEGRATORS",
+    "Implicit",
     "IntegrationResult",
     "Integrator",
     "LeastSquares",
     "LineIntegral",
+    "Proximal",
     "SlopeDLS",
     "SlopeDLSResult",
     "SpectralRegularization",
     "TikhonovRegularization",
+    "Unroll",
     "dls_objective",
 ]

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from torchdls import DLS, DinoKat
+from torchdls import DLS, DinoKat, Exact, SoupDIL
 
 FIGURES = np.load(Path(__file__).resolve().parents[2] / "data" / "dls_authors_46x60.npz")
 
 
 def option(name):
     if name == "soft":
-        return {"threshold": "soft"}
+        return {"learner": SoupDIL(threshold="soft")}
     return {"learner": {"hard": "soup_dil", "lowrank": DinoKat(rank=2), "fixed": "fixed", "unitary": "unitary"}[name]}
 
 
@@ -22,7 +22,8 @@ def option(name):
 ])  # fmt: skip
 def test_equals_the_authors_program(name, height, cost):
     method = DLS(
-        lam=float(FIGURES["lam"]), mu=float(FIGURES["mu"]), n_iter=15, tol=0, z_tol=1e-12, grad="none",
+        lam=float(FIGURES["lam"]), mu=float(FIGURES["mu"]), n_iter=15, tol=0,
+        height_step=Exact(1e-12), derivative="none",
         dictionary=torch.from_numpy(FIGURES["initial_dictionary"]), **option(name),
     )  # fmt: skip
     found = method.solve(torch.from_numpy(FIGURES["gradient"]))

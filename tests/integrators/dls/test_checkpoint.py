@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tests.helpers import random_field
-from torchdls import DLS, DLSResult, LeastSquares, dct_dictionary
+from torchdls import DLS, DLSResult, Exact, FixedDictionary, LeastSquares, Proximal, SoupDIL, Unroll, dct_dictionary
 
 H, W = 9, 8
 MASK = torch.ones(2, 1, H, W, dtype=torch.bool)
@@ -16,17 +16,19 @@ MASK[1, :, :2, 6:] = False
 
 CASES: dict[str, dict[str, Any]] = {
     "paper": {},
-    "block": {"order": "block"},
-    "unused kept": {"unused": "keep", "n_atoms": 20},
+    "block": {"learner": SoupDIL("block")},
+    "unused kept": {"learner": SoupDIL(unused="keep"), "n_atoms": 20},
     "unused first": {"n_atoms": 20, "mu": 1.0},
     "shared": {"learn": "shared"},
-    "shared, block": {"learn": "shared", "order": "block"},
+    "shared, block": {"learn": "shared", "learner": SoupDIL("block")},
     "fixed": {"learn": "fixed"},
-    "soft": {"threshold": "soft"},
-    "firm": {"threshold": "firm", "order": "block", "bound": 1.5},
-    "firm, fixed": {"threshold": "firm", "learn": "fixed", "bound": 1.5},
-    "two sweeps": {"n_sweeps": 2},
-    "proximal": {"z_step": "proximal"},
+    "soft": {"learner": SoupDIL(threshold="soft")},
+    "firm": {"learner": SoupDIL("block", threshold="firm", bound=1.5)},
+    "firm, fixed": {"learner": FixedDictionary("firm", bound=1.5)},
+    "two sweeps": {"learner": SoupDIL(n_sweeps=2)},
+    "proximal": {"height_step": "proximal"},
+    "accelerated": {"height_step": Proximal(3, accelerated=True)},
+    "schedule": {"mu": [0.6, 0.5, 0.5, 0.4, 0.3], "learner": SoupDIL(threshold="soft")},
     "stopped early": {"tol": 0.03, "n_iter": 30},
     "K-SVD": {"learner": "k_svd"},
     "low-rank atoms": {"learner": "dino_kat"},
@@ -54,15 +56,18 @@ def slopes(loss: Any, masked: bool, checkpoint: bool, options: dict[str, Any]) -
         "mu": 0.35,
         "n_iter": 5,
         "tol": 0.0,
-        "z_tol": 1e-12,
+        "height_step": Exact(1e-12),
     } | options
     atoms = dct_dictionary(3, settings["n_atoms"], dtype=torch.float64)
-    trained = {k: torch.nn.Parameter(torch.tensor(settings[k]).double()) for k in ("lam", "mu")}
+    trained = {
+        k: torch.nn.Parameter(torch.tensor(settings[k]).double())
+        for k in ("lam", "mu")
+        if not isinstance(settings[k], list)
+    }
     model = DLS(
         **settings | trained | {"dictionary": torch.nn.Parameter(atoms)},
         data_term=LeastSquares(tol=1e-13),
-        grad="unroll",
-        checkpoint=checkpoint,
+        derivative=Unroll(checkpoint),
     )
     g, w = random_field(2, 2, H, W).requires_grad_(), (random_field(2, 2, H, W, seed=7).abs() + 0.3).requires_grad_()
     result = model.solve(g, MASK if masked else None, w)
@@ -83,11 +88,11 @@ def test_checkpoint_changes_memory_alone(name: str, masked: bool) -> None:
 
 def test_callback_and_second_derivatives() -> None:
     g, seen = random_field(1, 2, H, W).requires_grad_(), []
-    model = DLS(3, n_atoms=9, mu=0.3, n_iter=5, tol=0.0, checkpoint=True)
+    model = DLS(3, n_atoms=9, mu=0.3, n_iter=5, tol=0.0, derivative=Unroll(checkpoint=True))
     result = model.solve(g, callback=lambda i, cost: seen.append((i, cost)))
     assert [i for i, _ in seen] == [1, 2, 3, 4, 5]
     torch.testing.assert_close(torch.stack([c for _, c in seen], 1), result.objective[:, 1:])
-    with pytest.raises(RuntimeError, match="checkpoint=True has first derivatives only"):
+    with pytest.raises(RuntimeError, match=r"checkpoint=True\) has first derivatives only"):
         torch.autograd.grad(result.height.square().sum(), g, create_graph=True)
 
 
@@ -104,6 +109,6 @@ def test_a_sweep_keeps_no_residual() -> None:
             return t
 
         with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
-            DLS(mu=2.0, n_iter=16, tol=0.0, checkpoint=checkpoint)(g)
+            DLS(mu=2.0, n_iter=16, tol=0.0, derivative=Unroll(checkpoint))(g)
         sizes[checkpoint] = sum(seen.values())
     assert 30 * sizes[True] < sizes[False]

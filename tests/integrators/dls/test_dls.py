@@ -12,8 +12,12 @@ from tests.helpers import MASKS, random_field, seeded, sparse_solve
 from torchdls import (
     DLS,
     DLSResult,
+    Exact,
+    FixedDictionary,
     LeastSquares,
     Patches,
+    Proximal,
+    SoupDIL,
     add_noise,
     dls_objective,
     edge_slopes,
@@ -59,11 +63,12 @@ GIVEN = [(), ("mask",), ("sieve",), ("weight",), ("anchor",), ("sieve", "weight"
 
 
 @pytest.mark.parametrize("given", GIVEN, ids=lambda g: "+".join(g) or "plain")
-@pytest.mark.parametrize("z_step", ["exact", "proximal"])
-@pytest.mark.parametrize("order", ["atom", "block"])
+@pytest.mark.parametrize("height_step", [Exact(1e-10), Proximal()], ids=repr)
 @pytest.mark.parametrize("learn", ["each", "shared", "fixed"])
-def test_objective_never_rises(learn, order, z_step, given):
-    dls = DLS(**SMALL, lam=0.7, mu=0.5, learn=learn, order=order, z_step=z_step, z_tol=1e-10)
+@pytest.mark.parametrize("order", ["atom", "block"])
+def test_objective_never_rises(order, learn, height_step, given):
+    learner = FixedDictionary() if (learn, order) == ("fixed", "block") else SoupDIL(order)
+    dls = DLS(**SMALL, lam=0.7, mu=0.5, learner=learner, learn=learn, height_step=height_step)
     objective = dls.solve(field(2), **inputs(2, *given)).objective
     assert objective.shape == (2, 7)
     assert_monotone(objective.sum(0) if learn == "shared" else objective)
@@ -73,11 +78,12 @@ def test_objective_never_rises(learn, order, z_step, given):
 @pytest.mark.parametrize(
     "options",
     [
-        {"n_sweeps": 3},
-        {"n_prox": 4, "z_step": "proximal"},
-        {"bound": 2.0},
-        {"bound": 0.3, "n_sweeps": 2},
-        {"unused": "keep", "mu": 3.0},
+        {"learner": SoupDIL(n_sweeps=3)},
+        {"height_step": Proximal(4)},
+        {"learner": SoupDIL(bound=2.0)},
+        {"learner": SoupDIL(bound=0.3, n_sweeps=2)},
+        {"learner": SoupDIL(unused="keep"), "mu": 3.0},
+        {"learner": FixedDictionary("soft", bound=1.0, n_sweeps=2)},
         {"stride": 4},
         {"patch_size": (3, 5), "stride": (2, 3), "n_atoms": 20},
         {"pixel_size": (0.5, 3.0)},
@@ -88,7 +94,7 @@ def test_objective_never_rises(learn, order, z_step, given):
     ids=str,
 )
 def test_objective_never_rises_whatever_the_options(options, given):
-    dls = DLS(**{**SMALL, "lam": 0.7, "mu": 0.5, "z_tol": 1e-10, **options})
+    dls = DLS(**{**SMALL, "lam": 0.7, "mu": 0.5, "height_step": Exact(1e-10), **options})
     assert_monotone(dls.solve(field(2), **inputs(2, *given)).objective)
 
 
@@ -100,7 +106,7 @@ def test_objective_never_rises_where_hardly_a_pixel_of_a_patch_is_valid():
         mask[..., 3:5, 2] = mask[..., 2:4, 6] = True
         g = 3 + 0.3 * torch.randn(1, 2, 10, 8, dtype=torch.float64, generator=draw)
         mu = float(10 ** (1.5 * torch.rand((), generator=draw) - 1))
-        dls = DLS(mu=mu, n_iter=2, tol=0.0, learn="fixed", z_tol=1e-9)
+        dls = DLS(mu=mu, n_iter=2, tol=0.0, learn="fixed", height_step=Exact(1e-9))
         anchors = {"anchor": torch.zeros_like(g[:, :1]), "anchor_weight": mask.double()}  # the constants stay
         result = dls.solve(g, mask, **anchors)
         objective = result.objective[0]
@@ -152,12 +158,12 @@ def test_objective_is_the_cost_of_what_is_returned():
 
 
 @pytest.mark.parametrize("given", GIVEN, ids=lambda g: "+".join(g) or "plain")
-@pytest.mark.parametrize("z_step", ["exact", "proximal"])
-def test_without_patches_it_is_least_squares(z_step, given):
+@pytest.mark.parametrize("height_step", [Exact(1e-11), Proximal()], ids=repr)
+def test_without_patches_it_is_least_squares(height_step, given):
     """lam = 0: the patches have no say, every height is the least-squares one."""
     g, given = field(2), inputs(2, *given)
     expected = LeastSquares(tol=1e-11)(g, **given)
-    dls = DLS(**SMALL, lam=0.0, mu=0.5, z_step=z_step, z_tol=1e-11, data_term=LeastSquares(tol=1e-11))
+    dls = DLS(**SMALL, lam=0.0, mu=0.5, height_step=height_step, data_term=LeastSquares(tol=1e-11))
     torch.testing.assert_close(dls(g, **given), expected, rtol=0, atol=1e-7)
     torch.testing.assert_close(DLS(**{**SMALL, "n_iter": 0})(g, **given), LeastSquares()(g, **given))
 
@@ -187,15 +193,15 @@ def test_a_huge_threshold_leaves_only_the_pull_of_the_patches(mask, mu):
 def test_all_codes_kept_is_least_squares_too():
     """mu = 0 with an orthonormal dictionary: the patches are met exactly and pull nowhere, and atoms stay."""
     g = field(2)
-    for learn in ("fixed", "each"):
-        z = DLS(**SMALL, mu=0.0, order="block", learn=learn)(g)
+    for learner in ("fixed", SoupDIL("block")):
+        z = DLS(**SMALL, mu=0.0, learner=learner)(g)
         torch.testing.assert_close(z, LeastSquares()(g), rtol=0, atol=1e-5)
 
 
 def test_a_clean_plane_is_exact_with_mu_from_its_noise():
     for shape, slopes in [((16, 16), (0.3, -0.7)), ((13, 18), (5.0, 0.0))]:
         g = torch.tensor(slopes, dtype=torch.float64).view(1, 2, 1, 1).expand(1, 2, *shape)
-        torch.testing.assert_close(DLS(**SMALL, order="block")(g), LeastSquares()(g), rtol=0, atol=1e-5)
+        torch.testing.assert_close(DLS(**SMALL, learner=SoupDIL("block"))(g), LeastSquares()(g), rtol=0, atol=1e-5)
 
 
 def test_auto_follows_the_scale_of_the_slopes_and_the_pixels():
@@ -293,7 +299,7 @@ def test_patches_side_by_side_need_no_iterative_solve(given, monkeypatch):
     fields = {}
     if given:
         fields = {"anchor": random_field(2, 1, 24, 16, seed=1), "anchor_weight": given["anchor"]}
-    dls = DLS(patch_size=4, stride=4, n_atoms=16, lam=0.05, mu=0.3, n_iter=3, tol=0.0, z_tol=1e-12)
+    dls = DLS(patch_size=4, stride=4, n_atoms=16, lam=0.05, mu=0.3, n_iter=3, tol=0.0, height_step=Exact(1e-12))
     assert not Patches(4, 4).tile((24, 15))
     with monkeypatch.context() as patch:
         patch.setattr(Patches, "tile", lambda *_: False)

@@ -1,23 +1,35 @@
 """What DLS reads from its data and settings: the noise, the initial dictionary; and what it refuses."""
 
+import inspect
+
 import pytest
 import torch
 from torch import nn
 
-from tests.helpers import assert_unchanged, random_field, seeded
+from tests.helpers import MASKS, assert_unchanged, random_field, seeded
 from tests.integrators.dls.test_dls import SMALL, H, W, field
 from torchdls import (
     DLS,
+    KSVD,
     SURFACES,
     DinoKat,
+    Exact,
+    FixedDictionary,
+    GradientOperator,
+    Implicit,
     LeastSquares,
     LineIntegral,
+    Proximal,
+    SoupDIL,
     TotalVariation,
+    Unitary,
     add_noise,
     dct_dictionary,
+    edge_slopes,
     noise_level,
     rmse,
 )
+from torchdls.integrators.dls.iteration import iterate, objective, start, update_height
 
 
 def test_noise_is_that_of_the_surface_on_oblong_pixels():
@@ -64,7 +76,7 @@ def test_initial_dictionary_is_normalised_kept_or_trained():
     assert set(dls.state_dict()) == {"dictionary"}
     scaled = DLS(**SMALL, mu=0.5, dictionary=3 * atoms, learn="fixed")(g)
     torch.testing.assert_close(scaled, result.height)
-    trained = DLS(**SMALL, mu=0.5, dictionary=nn.Parameter(atoms), learn="fixed", grad="unroll")
+    trained = DLS(**SMALL, mu=0.5, dictionary=nn.Parameter(atoms), learn="fixed", derivative="unroll")
     trained(g).square().sum().backward()
     assert trained.dictionary.grad.isfinite().all()
     assert trained.dictionary.grad.abs().max() > 0
@@ -107,15 +119,15 @@ def test_shared_dictionary_of_one_surface_is_its_own():
         ({"mu": "none"}, "mu='none'"),
         ({"n_iter": -1}, "n_iter=-1"),
         ({"n_iter": 2.5}, "n_iter=2.5"),
-        ({"n_sweeps": 0}, "n_sweeps=0"),
-        ({"n_prox": 0}, "n_prox=0"),
-        ({"z_step": "fast"}, "z_step='fast' is unknown; choose from 'exact', 'proximal'"),
-        ({"order": "row"}, "order='row'"),
+        ({"mu": [1.0, 0.5]}, "mu has 2 values for n_iter=50 iterations"),
+        ({"mu": [1.0, -0.5], "n_iter": 2}, "a schedule of numbers of at least 0 is needed"),
+        ({"mu": [1.0, 0.5], "n_iter": 2, "select": True}, "does not go with a schedule"),
+        ({"lam": [1.0, 0.5]}, "lam is a list"),
+        ({"height_step": "fast"}, "height_step='fast' is unknown; choose from 'exact', 'proximal', or make a Exact"),
+        ({"height_step": 3}, "height_step=3 is unknown"),
+        ({"derivative": "backward"}, "derivative='backward' is unknown; choose from 'auto', 'unroll', 'implicit'"),
         ({"learn": "none"}, "learn='none'"),
-        ({"unused": "last"}, "unused='last'"),
-        ({"bound": 0.0}, "bound=0.0"),
         ({"tol": -1e-3}, "tol=-0.001"),
-        ({"z_tol": 0.0}, "z_tol=0.0"),
         ({"data_term": "tv"}, "data_term is a str"),
         ({"data_term": LineIntegral()}, "data_term LineIntegral is not built on the weighted solve"),
         ({"dictionary": [[1.0]]}, "dictionary is a list"),
@@ -124,11 +136,8 @@ def test_shared_dictionary_of_one_surface_is_its_own():
         ({"dictionary": torch.zeros(64, 4)}, "atom that is zero or not finite"),
         ({"dictionary": torch.full((64, 4), torch.nan)}, "atom that is zero or not finite"),
         ({"pixel_size": 0}, "pixel_size: 0 given"),
-        ({"learner": "k_svd", "order": "block"}, "order='block' does not go with learner=KSVD"),
-        ({"learner": "fixed", "unused": "keep"}, "unused='keep' does not go with learner=FixedDictionary"),
+        ({"learner": SoupDIL("block"), "learn": "fixed"}, "order='block', .* have no effect with learn='fixed'"),
         ({"learner": "fixed", "learn": "shared"}, "learn='shared' does not go with a fixed dictionary"),
-        ({"n_prox": 3}, "n_prox=3 does not go with z_step='exact'"),
-        ({"learn": "fixed", "checkpoint": True}, "checkpoint=True does not go with grad='implicit'"),
     ],
     ids=str,
 )
@@ -152,10 +161,90 @@ def test_fields_that_do_not_fit_the_settings_are_named(options, shape, message):
         DLS(**options)(torch.zeros(shape))
 
 
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: SoupDIL("row"), "SoupDIL: order='row' is unknown; choose from 'atom', 'block'"),
+        (lambda: SoupDIL(unused="last"), "SoupDIL: unused='last'"),
+        (lambda: SoupDIL(threshold="medium"), "SoupDIL: threshold='medium'"),
+        (lambda: SoupDIL(bound=0.0), "SoupDIL: bound=0.0"),
+        (lambda: SoupDIL(n_sweeps=0), "SoupDIL: n_sweeps=0"),
+        (lambda: FixedDictionary("medium"), "FixedDictionary: threshold='medium'"),
+        (lambda: KSVD(bound=-1.0), "KSVD: bound=-1.0"),
+        (lambda: Unitary(bound=float("nan")), "Unitary: bound=nan"),
+        (lambda: Exact(0.0), "Exact: tol=0.0"),
+        (lambda: Implicit(-1.0), "Implicit: tol=-1.0"),
+        (lambda: Proximal(0), "Proximal: steps=0"),
+        (lambda: Proximal(accelerated=True), "accelerated=True has no effect with steps=1"),
+    ],
+)
+def test_bad_settings_of_parts_are_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_it_has_at_most_fifteen_options():
+    assert len(inspect.signature(DLS).parameters) <= 15
+
+
+@pytest.mark.parametrize("given", [{}, {"mask": MASKS["ring_and_islands"](H, W)}], ids=["plain", "mask"])
+def test_a_schedule_is_one_threshold_after_the_other(given):
+    """Each iteration is that of a run with this threshold alone, from where the last one ended."""
+    g, mus = field(2), [0.9, 0.6, 0.6, 0.3]
+    found = DLS(**{**SMALL, "n_iter": 4}, lam=0.5, mu=mus, height_step=Exact(1e-12)).solve(g, **given)
+    assert found.mu.tolist() == [0.3, 0.3]
+    dls = DLS(**SMALL, lam=0.5, mu=1.0, height_step=Exact(1e-12))
+    fields = dls.check(g, **given)
+    problem, settings = dls._problem(fields, noise_level(g, **given)), dls._settings
+    state = start(problem, dls._initial_dictionary(fields), settings)
+    costs = []
+    for i, mu in enumerate(mus):
+        problem = problem._replace(mu=torch.full((2,), mu, dtype=g.dtype))
+        state = iterate(problem, state, settings, i)
+        costs.append(objective(problem, state, settings))
+    torch.testing.assert_close(found.objective[:, 1:], torch.stack(costs, 1))
+    torch.testing.assert_close(found.codes, state.B)
+
+
+def test_no_surface_stops_before_the_last_change_of_the_schedule():
+    plane = torch.ones(1, 2, H, W, dtype=torch.float64)
+    falling = DLS(**{**SMALL, "tol": 0.5, "n_iter": 6}, mu=[3.0, 2.0, 1.0, 1.0, 1.0, 1.0]).solve(plane)
+    assert falling.iterations.tolist() == [3]
+    assert falling.converged.all()
+
+
+def test_accelerated_steps_are_those_of_nesterov():
+    """Against the same recursion on the dense normal equations; and they get further than plain ones."""
+    g = field()
+    dls = DLS(**SMALL, lam=0.5, mu=0.5)
+    problem, settings = dls._problem(dls.check(g), noise_level(g)), dls._settings
+    state = start(problem, dls._initial_dictionary(problem.fields), settings)
+    a = GradientOperator()
+    M = torch.func.jacrev(lambda z: a(z.view(1, 1, H, W)).flatten())(torch.zeros(H * W, dtype=g.dtype))
+    v, _ = edge_slopes(g)
+    r = problem.coverage.expand(1, 1, H, W).flatten()  # 2 lam c
+    pull = r * state.z.flatten() / 2
+    z = y = state.z.flatten()
+    t, tau = 1.0, 1 / a.norm_bound**2
+    for _ in range(3):
+        new = (y - tau * M.T @ (M @ y - v.flatten()) + tau * pull) / (1 + tau * r)
+        t, old = (1 + (1 + 4 * t * t) ** 0.5) / 2, t
+        z, y = new, new + (old - 1) / t * (new - z)
+    folded = problem.coverage * state.z / 2
+    steps = settings._replace(height_step=Proximal(3, accelerated=True))
+    torch.testing.assert_close(update_height(problem, state.z, folded, steps).flatten(), z)
+    best = update_height(problem, state.z, folded, settings._replace(height_step=Exact(1e-12)))
+    many = [
+        update_height(problem, state.z, folded, settings._replace(height_step=Proximal(30, a))) for a in (False, True)
+    ]
+    plain, fast = ((z - best).norm() for z in many)
+    assert fast < 0.5 * plain
+
+
 def selected(surface, snr, **options):
     surface = SURFACES[surface](48, dtype=torch.float64)
     gradient = add_noise(surface.gradient, snr, seeded(2))
-    return surface, gradient, DLS(select=True, n_iter=8, tol=0, z_tol=1e-11, **options).solve(gradient)
+    return surface, gradient, DLS(select=True, n_iter=8, tol=0, height_step=Exact(1e-11), **options).solve(gradient)
 
 
 @pytest.mark.slow
@@ -167,7 +256,9 @@ def test_select_takes_the_threshold_of_the_smaller_error():
     plain, default = LeastSquares()(gradient), DLS(n_iter=8, tol=0)(gradient)
     errors = [float(rmse(z, surface.height)) for z in (found.height, default, plain)]
     assert errors == sorted(errors)
-    torch.testing.assert_close(DLS(lam=0.5, mu=found.mu, n_iter=8, tol=0, z_tol=1e-11)(gradient), found.height)
+    torch.testing.assert_close(
+        DLS(lam=0.5, mu=found.mu, n_iter=8, tol=0, height_step=Exact(1e-11))(gradient), found.height
+    )
 
 
 @pytest.mark.slow
@@ -176,7 +267,7 @@ def test_select_keeps_least_squares_where_nothing_is_to_gain_each_surface_for_it
     _, fractal, second = selected("fractal", 40)
     assert second.lam == 0
     torch.testing.assert_close(second.height, LeastSquares()(fractal), rtol=0, atol=1e-7)
-    both = DLS(select=True, n_iter=8, tol=0, z_tol=1e-11).solve(torch.cat([tent, fractal]))
+    both = DLS(select=True, n_iter=8, tol=0, height_step=Exact(1e-11)).solve(torch.cat([tent, fractal]))
     torch.testing.assert_close(both.height, torch.cat([first.height, second.height]), rtol=0, atol=1e-7)
     assert both.lam.tolist() == [0.5, 0]
 
@@ -192,9 +283,9 @@ def test_select_sets_a_given_threshold_against_least_squares():
 @pytest.mark.slow
 def test_the_choice_is_held_fixed_in_the_derivative():
     _, gradient, found = selected("tent", 1)
-    chosen = DLS(lam=0.5, mu=found.mu, n_iter=8, tol=0, z_tol=1e-11)
+    chosen = DLS(lam=0.5, mu=found.mu, n_iter=8, tol=0, height_step=Exact(1e-11))
     slopes = []
-    for model in (DLS(select=True, n_iter=8, tol=0, z_tol=1e-11), chosen):
+    for model in (DLS(select=True, n_iter=8, tol=0, height_step=Exact(1e-11)), chosen):
         point = gradient.clone().requires_grad_()
         model(point).square().sum().backward()
         slopes.append(point.grad)

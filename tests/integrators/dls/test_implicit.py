@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tests.helpers import random_field
-from torchdls import DLS, LeastSquares, dct_dictionary
+from torchdls import DLS, Exact, FixedDictionary, Implicit, LeastSquares, Unroll, dct_dictionary
 
 H, W = 9, 8
 MASK = torch.ones(1, 1, H, W, dtype=torch.bool)
@@ -15,10 +15,13 @@ MASK[..., 3:5, 3:5] = False
 MASK[..., :2, 6:] = False
 
 
-def converged(grad: str = "implicit", **options: Any) -> DLS:
+IMPLICIT = Implicit(1e-10)
+
+
+def converged(derivative: Any = IMPLICIT, **options: Any) -> DLS:
     settings = {"patch_size": 3, "n_atoms": 9, "lam": 0.3, "mu": 0.8, "n_iter": 6000, "learn": "fixed"}
-    settings |= {"tol": 1e-8, "z_tol": 1e-11, "grad_tol": 1e-10}
-    return DLS(grad=grad, data_term=LeastSquares(tol=1e-13), **{**settings, **options})
+    settings |= {"tol": 1e-8, "height_step": Exact(1e-11)}
+    return DLS(derivative=derivative, data_term=LeastSquares(tol=1e-13), **{**settings, **options})
 
 
 def centred(z: Tensor, mask: Tensor | None) -> Tensor:
@@ -30,8 +33,8 @@ def centred(z: Tensor, mask: Tensor | None) -> Tensor:
 overcomplete = dct_dictionary(3, 16, dtype=torch.float64)
 CASES: dict[str, tuple[dict[str, Any], dict[str, Tensor]]] = {
     "rectangle": ({}, {}),
-    "soft": ({"threshold": "soft", "mu": 0.3}, {}),
-    "bound": ({"bound": 1.5}, {}),
+    "soft": ({"learner": FixedDictionary("soft"), "mu": 0.3}, {}),
+    "bound": ({"learner": FixedDictionary(bound=1.5)}, {}),
     "overcomplete": ({"dictionary": overcomplete}, {}),
     "mask": ({}, {"mask": MASK}),
     "weight": ({}, {"weight": random_field(1, 2, H, W, seed=1).abs() + 0.3}),
@@ -49,7 +52,7 @@ def test_equals_finite_differences_of_the_converged_map(case: str, capsys: pytes
     values = {"gradient": g, "lam": lam, "mu": mu, "dictionary": D}
     values |= {k: v for k, v in fields.items() if v.is_floating_point()}
     directions = {k: random_field(*v.shape, seed=20 + i) for i, (k, v) in enumerate(values.items())}
-    directions["mu"] = directions["mu"] * (0 if options.get("threshold") is None else 1)
+    directions["mu"] = directions["mu"] * (0 if "soft" not in repr(options.get("learner")) else 1)
 
     def run(point: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         model = converged(**options)
@@ -87,10 +90,10 @@ def test_other_modes_and_what_they_promise(capsys: pytest.CaptureFixture[str]) -
         height = centred(converged(**options)(point), None)
         return torch.autograd.grad((height * c).sum(), point)[0]
 
-    implicit, unrolled = slope(), slope(grad="unroll", n_iter=200, tol=1e-6)
+    implicit, unrolled = slope(), slope(derivative="unroll", n_iter=200, tol=1e-6)
     torch.testing.assert_close(implicit, unrolled, rtol=1e-4, atol=1e-5)
     learned = {"learn": "each", "n_iter": 40, "tol": 0.0}
-    exact, frozen = slope(grad="unroll", **learned), slope(grad="frozen_dictionary", **learned)
+    exact, frozen = (slope(derivative=d, **learned) for d in ("unroll", Implicit(1e-10, frozen_dictionary=True)))
     error = float((frozen - exact).norm() / exact.norm())
     with capsys.disabled():
         print(f"\n  learned dictionary: 'frozen_dictionary' is {error:.0%} off 'unroll'", end="")
@@ -132,15 +135,13 @@ def test_second_derivative_and_transforms() -> None:
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"grad": "implicit", "learn": "each"}, "take 'unroll' .* or 'frozen_dictionary'"),
-        ({"grad": "frozen_dictionary"}, "take 'implicit'"),
-        ({"grad": "implicit", "threshold": "firm"}, "needs a quadratic data term and hard or soft thresholds"),
+        ({"derivative": "implicit", "learn": "each"}, "take 'unroll' .* or 'frozen_dictionary'"),
+        ({"derivative": "frozen_dictionary"}, "take 'implicit'"),
+        ({"learner": FixedDictionary("firm")}, "needs a data term that is one quadratic, and hard or soft thresholds"),
         (
-            {"grad": "frozen_dictionary", "learn": "each", "dictionary": torch.nn.Parameter(torch.eye(9))},
+            {"derivative": "frozen_dictionary", "learn": "each", "dictionary": torch.nn.Parameter(torch.eye(9))},
             "gives a trained dictionary no derivative",
         ),
-        ({"grad": "backward"}, "grad='backward' is unknown"),
-        ({"grad_tol": 0.0}, "grad_tol=0.0 must be positive"),
     ],
 )
 def test_modes_that_do_not_exist_are_refused(options: dict[str, Any], message: str) -> None:
@@ -149,5 +150,6 @@ def test_modes_that_do_not_exist_are_refused(options: dict[str, Any], message: s
 
 
 def test_automatic_mode() -> None:
-    assert DLS(learn="fixed").grad == "implicit"
-    assert DLS().grad == DLS(learn="fixed", threshold="firm").grad == "unroll"
+    assert DLS(learn="fixed")._derivative == DLS(learner="fixed")._derivative == Implicit()
+    assert DLS()._derivative == DLS(learner=FixedDictionary("firm"))._derivative == Unroll()
+    assert DLS(derivative="none")._derivative is None

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchdls import DLS, Patches
+from torchdls import DLS, Exact, Patches
 from torchdls.integrators.base import Fields
 from torchdls.integrators.dls import integrator as dls_module
 from torchdls.integrators.dls.window import live_window
@@ -36,7 +36,7 @@ def test_dls_is_the_same_within_the_window_and_without(monkeypatch):
     mask = torch.zeros(2, 1, 31, 40, dtype=torch.bool)
     mask[0, :, 4:15, 10:22] = True
     mask[1, :, 9:18, 13:29] = torch.rand(9, 16, generator=generator) > 0.1
-    method = DLS(n_iter=4, tol=0, z_tol=1e-13)
+    method = DLS(n_iter=4, tol=0, height_step=Exact(1e-13))
     within = method.solve(gradient, mask)
     monkeypatch.setattr(dls_module, "live_window", lambda mask, patches: None)
     without = method.solve(gradient, mask)

@@ -18,6 +18,7 @@ from torchdls import (
     L1,
     SURFACES,
     AnisotropicDiffusion,
+    Exact,
     Huber,
     LeastSquares,
     MEstimator,
@@ -288,7 +289,7 @@ def test_dls_with_weighted_least_squares_never_raises_its_objective(mask):
 def check_descent(data_term, mask):
     g = add_noise(SURFACES["tent"](24, dtype=torch.float64).gradient, snr_db=8, generator=seeded(0))
     g[:, 1, 12, 5:15] += 3
-    model = DLS(stride=4, data_term=data_term, tol=0, n_iter=3, lam=0.5, mu=0.2, z_tol=1e-9)
+    model = DLS(stride=4, data_term=data_term, tol=0, n_iter=3, lam=0.5, mu=0.2, height_step=Exact(1e-9))
     objective = model.solve(g, None if mask is None else MASKS[mask](24, 24)).objective
     assert (objective.diff(dim=1) <= 1e-9 * objective[:, :1]).all()
     assert objective[0, -1] < objective[0, 0]

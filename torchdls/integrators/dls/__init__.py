@@ -2,5 +2,6 @@
 
 from torchdls.integrators.dls.integrator import DLS, DLSResult
 from torchdls.integrators.dls.objective import dls_objective
+from torchdls.integrators.dls.options import Exact, Implicit, Proximal, Unroll
 
-__all__ = ["DLS", "DLSResult", "dls_objective"]
+__all__ = ["DLS", "DLSResult", "Exact", "Implicit", "Proximal", "Unroll", "dls_objective"]

@@ -17,37 +17,20 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchdls.dictionary.learners import FixedDictionary, Learner, SoupDIL
+from torchdls.dictionary.learners import FixedDictionary, SoupDIL
 from torchdls.dictionary.sweep_adjoint import Codes, Sweep
-from torchdls.dictionary.thresholds import Threshold
-from torchdls.integrators.dls.problem import Finished, Problem, State, codes_pay, merge, support
-from torchdls.integrators.iterative import Callback
-
-
-class Iteration(NamedTuple):
-    """What DLS provides: the parts of an iteration, and its options.
-
-    `round` makes one iteration and tells the objective after it, `settled` which surfaces a step was short for (N,),
-    `step` the height from the one before and the folded residual of the patches.
-    """
-
-    round: Callable[[Problem, State, bool], tuple[State, Tensor]]
-    settled: Callable[[State, State], Tensor]
-    step: Callable[[Problem, Tensor, Tensor], Tensor]
-    learner: Learner
-    learn: bool
-    n_sweeps: int
-    bound: float
-    threshold: Threshold
-    tol: float
+from torchdls.integrators.dls.iteration import Settings, iterate, objective, settled, update_height
+from torchdls.integrators.dls.problem import End, Problem, State, codes_pay, support
+from torchdls.integrators.settling import Settled, run_until_settled
 
 
 class Kept(NamedTuple):
-    """A state without its zeros: height, dictionary, and the nonzero codes at their places (N, m).
+    """A state without its zeros: first height, height, dictionary, and the nonzero codes at their places (N, m).
 
     `R` is there before the first sweep only, and only with a mask: elsewhere it follows from the others.
     """
 
+    start: Tensor
     z: Tensor
     D: Tensor
     values: Tensor
@@ -61,7 +44,7 @@ class Kept(NamedTuple):
         places, used = support(state.B != 0)
         surfaces = torch.arange(len(places), device=places.device)[:, None]
         values = torch.where(used, state.B.flatten(1)[surfaces, places], 0)
-        return Kept(state.z, state.D, values, R, places.to(torch.int32), used)
+        return Kept(state.start.detach(), state.z, state.D, values, R, places.to(torch.int32), used)
 
     @property
     def n_codes(self) -> list[int]:
@@ -75,91 +58,68 @@ class Kept(NamedTuple):
         flat = self.values.new_zeros(len(self.z), shape[1] * shape[2])
         return flat.scatter_add(1, self.places.long(), self.values).view(shape)
 
-    def state(self, model: Problem, start: Tensor) -> State:
+    def state(self, model: Problem) -> State:
         """All of it again."""
         B = self.codes(model)
         if self.R is not None:
-            return State(start, self.z, self.R.mT.clone().mT, self.D, B)
+            return State(self.start, self.z, self.R.mT.clone().mT, self.D, B)
         P, minus = model.patches.extract(self.z).mT, (B.mT, self.D.mT.expand(len(B), -1, -1))
         R = P.baddbmm(*minus, alpha=-1) if torch.is_grad_enabled() else P.baddbmm_(*minus, alpha=-1)
-        return State(start, self.z, _inside(R.mT, model), self.D, B)
-
-    def select(self, keep: Tensor) -> Kept:
-        """The surfaces that `keep` holds."""
-        parts = (t[keep] if t is not None and len(t) == len(keep) else t for t in self)
-        return Kept(*parts)  # type: ignore[arg-type]
-
-    def end(self, model: Problem) -> State:
-        """Height, dictionary and codes of surfaces that have stopped; what the iterations need besides is left out."""
-        return State(self.z, self.z, self.z, self.D, self.codes(model))
+        return State(self.start, self.z, _inside(R.mT, model), self.D, B)
 
 
 class Run(NamedTuple):
-    """Some iterations: how they are made, from where, how many at most, and whether the first of all is among them."""
+    """Some iterations: how they are made, from where, how many at most, and how many were made before them."""
 
-    dls: Iteration
+    settings: Settings
     model: Problem
     start: Tensor
     places: Tensor
     used: Tensor
     limit: int
-    first: bool
+    made: int
 
     def kept(self, z: Tensor, D: Tensor, values: Tensor, R: Tensor | None) -> Kept:
         """The state that the run sets out from."""
-        return Kept(z, D, values, R, self.places, self.used)
+        return Kept(self.start, z, D, values, R, self.places, self.used)
 
     def iterations(self, kept: Kept) -> Iterator[tuple[State, Tensor, Tensor]]:
         """States, objectives, and which surfaces have settled; ends with the first iteration in which one does."""
-        state = kept.state(self.model, self.start)
-        for i in range(self.limit):
+        state = kept.state(self.model)
+        for iteration in range(self.made, self.made + self.limit):
             z = state.z
-            state, cost = self.dls.round(self.model, state, self.first and i == 0)
-            settled = self.dls.settled(state, state._replace(z=z))
-            yield state, cost, settled
-            if self.dls.tol > 0 and bool(settled.any()):
+            state = iterate(self.model, state, self.settings, iteration)
+            done = settled(self.model, state, z, self.settings, iteration)
+            yield state, objective(self.model, state, self.settings, iteration), done
+            if self.settings.tol > 0 and bool(done.any()):
                 return
 
 
 def run_in_legs(
-    dls: Iteration, model: Problem, state: State, cost: Tensor, n_iter: int, callback: Callback | None
-) -> tuple[State, Tensor, Tensor, Tensor]:
-    """The iterations from `state`, whose objective is `cost` (N,).
+    model: Problem,
+    state: State,
+    cost: Tensor,
+    settings: Settings,
+    n_iter: int,
+    callback: Callable[[int, Tensor], None] | None,
+) -> Settled[End]:
+    """The iterations from `state`, whose objective is `cost` (N,), in legs that each keep their first state alone.
 
-    A run ends early where a surface settles; that surface then leaves the batch.
-
-    Returns:
-        The last state, without what iterations alone need; the objectives (N, n_iter + 1); which surfaces are still
-        on their way (N,); the iterations that each took (N,).
+    A leg ends early where a surface settles; that surface then leaves the batch.
     """
-    index = torch.arange(len(cost), device=cost.device)
-    start, kept = state.start.detach(), Kept.of(state, None if model.valid is None else state.R)
-    costs, active, parts = [cost], torch.ones_like(cost, dtype=torch.bool), []
-    taken = torch.zeros_like(index)
-    del state
-    while len(costs) <= n_iter and len(index):
-        count = min(isqrt(n_iter - 1) + 1, n_iter + 1 - len(costs))
-        kept, found, settled = advance(Run(dls, model, start, kept.places, kept.used, count, len(costs) == 1), kept)
-        taken = taken.index_add(0, index, torch.full_like(index, found.shape[1]))
-        for value in found.unbind(1):
-            costs.append(costs[-1].index_copy(0, index, value))
-            if callback is not None:
-                callback(len(costs) - 1, costs[-1].detach())
-        active = active.index_copy(0, index, ~settled)
-        if dls.tol > 0 and bool(settled.any()):
-            parts.append(Finished(index[settled], kept.select(settled).end(model.select(settled))))
-            index, start, kept, model = index[~settled], start[~settled], kept.select(~settled), model.select(~settled)
-    if len(index):
-        parts.append(Finished(index, kept.end(model)))
-    costs += [costs[-1]] * (n_iter + 1 - len(costs))
-    return merge(parts), torch.stack(costs, 1), active, taken
+    leg = isqrt(max(n_iter - 1, 0)) + 1
 
+    def advance(model: Problem, kept: Kept, _: Tensor, made: int) -> tuple[Kept, Tensor, Tensor]:
+        run = Run(settings, model, kept.start, kept.places, kept.used, min(leg, n_iter - made), made)
+        tensors = kept.z, kept.D, kept.values, kept.R
+        z, D, values, costs, places, used, done = _Run.apply(run, *tensors, *_tensors(run.model))
+        return Kept(kept.start, z, D, values, None, places, used), costs, done
 
-def advance(run: Run, kept: Kept) -> tuple[Kept, Tensor, Tensor]:
-    """The state after the run, the objectives (N, iterations), and which surfaces have settled (N,)."""
-    tensors = kept.z, kept.D, kept.values, kept.R
-    z, D, values, costs, places, used, settled = _Run.apply(run, *tensors, *_tensors(run.model))
-    return Kept(z, D, values, None, places, used), costs, settled
+    def end(model: Problem, kept: Kept) -> End:
+        return End(kept.z, kept.D, kept.codes(model))
+
+    kept = Kept.of(state, None if model.valid is None else state.R)
+    return run_until_settled(model, kept, cost, advance, n_iter, tol=settings.tol, finish=end, callback=callback)
 
 
 class _Run(torch.autograd.Function):
@@ -173,25 +133,27 @@ class _Run(torch.autograd.Function):
         ctx.save_for_backward(z, D, values, R)
         ctx.set_materialize_grads(False)
         costs = []
-        for state, cost, settled in ctx.run.iterations(run.kept(z, D, values, R)):  # noqa: B007 the last ones are used
+        for state, cost, done in ctx.run.iterations(run.kept(z, D, values, R)):  # noqa: B007 the last ones are used
             costs.append(cost)
         end = Kept.of(state)
-        ctx.mark_non_differentiable(end.places, end.used, settled)
-        return end.z, end.D.view_as(end.D), end.values, torch.stack(costs, 1), end.places, end.used, settled
+        ctx.mark_non_differentiable(end.places, end.used, done)
+        return end.z, end.D.view_as(end.D), end.values, torch.stack(costs, 1), end.places, end.used, done
 
     @staticmethod
     def backward(ctx: Any, gz: Tensor, gD: Tensor, gv: Tensor, g_costs: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
-            raise RuntimeError("DLS: checkpoint=True has first derivatives only; take checkpoint=False for second ones")
+            raise RuntimeError("DLS: Unroll(checkpoint=True) has first derivatives only; take Unroll() for second ones")
         run = ctx.run
         z, D, values, R = ctx.saved_tensors
         states = [run.kept(z, D, values, R)]
         states += [Kept.of(state) for state, *_ in run.iterations(states[0])]
-        slopes = [torch.zeros_like(t) if g is None else g for t, g in zip(states[-1][:3], (gz, gD, gv), strict=True)]
+        end = states[-1]
+        found = zip((end.z, end.D, end.values), (gz, gD, gv), strict=True)
+        slopes = [torch.zeros_like(t) if g is None else g for t, g in found]
         total: list[Tensor | None] = [None] * len(_tensors(run.model))
         g_R = None
         for i in reversed(range(len(states) - 1)):
-            back = _Back(run, after=states.pop(), before=states[-1], first=run.first and i == 0)
+            back = _Back(run, after=states.pop(), before=states[-1], iteration=run.made + i)
             slopes, g_R, leaves = back.pull(slopes, None if g_costs is None else g_costs[:, i])
             total = [a if b is None else b if a is None else a + b for a, b in zip(total, leaves, strict=True)]
         return None, *slopes, g_R, *total
@@ -207,11 +169,22 @@ class _Back(NamedTuple):
     run: Run
     before: Kept
     after: Kept
-    first: bool
+    iteration: int
+
+    @property
+    def first(self) -> bool:
+        """Whether it is the first of all."""
+        return self.iteration == 0
+
+    @property
+    def model(self) -> Problem:
+        """The problem with the threshold of this iteration."""
+        return self.run.model.at(self.iteration)
 
     def pull(self, slopes: list[Tensor], g_cost: Tensor | None) -> Pulled:
         """From gradients in the state after the iteration to those before it, in R if given, and in the model."""
-        undo = isinstance(self.run.dls.learner, SoupDIL | FixedDictionary) and self.run.dls.n_sweeps == 1
+        learner = self.run.settings.learner
+        undo = isinstance(learner, SoupDIL | FixedDictionary) and learner.n_sweeps == 1
         return self._undone(*slopes) if undo and g_cost is None else self._taped(slopes, g_cost)
 
     def _taped(self, slopes: list[Tensor], g_cost: Tensor | None) -> Pulled:
@@ -219,10 +192,11 @@ class _Back(NamedTuple):
         with torch.enable_grad():
             leaves = [_leaf(t) for t in _tensors(self.run.model)]
             model = _with_tensors(self.run.model, iter(leaves))
-            z, D, values = (_leaf(t) for t in self.before[:3])
+            z, D, values = (_leaf(t) for t in (self.before.z, self.before.D, self.before.values))
             R = None if self.before.R is None else _leaf(self.before.R)
             kept = self.before._replace(z=z, D=D, values=values, R=R)
-            new, cost = self.run.dls.round(model, kept.state(model, self.run.start), self.first)
+            new = iterate(model, kept.state(model), self.run.settings, self.iteration)
+            cost = objective(model, new, self.run.settings, self.iteration)
             places = self.after.places.long()
             outputs = [new.z, new.D, torch.where(self.after.used, new.B.flatten(1).gather(1, places), 0)]
             outputs, back = ([*outputs, cost], [*slopes, g_cost]) if g_cost is not None else (outputs, slopes)
@@ -235,13 +209,13 @@ class _Back(NamedTuple):
 
     def _undone(self, gz: Tensor, gD: Tensor, gv: Tensor) -> Pulled:
         """By undoing the sweep."""
-        dls, model, patches = self.run.dls, self.run.model, self.run.model.patches
-        state = self.before.state(model, self.run.start)
+        settings, model, patches = self.run.settings, self.model, self.model.patches
+        state = self.before.state(model)
         codes = [Codes.of(b) for b in _rows(state.B, self._alone(state.D))]
         bare = _inside(state.R, model).clone() if self.first and model.valid is not None else None
-        R, D, B = dls.learner(state.R, state.D, state.B, model.mu[:, None], dls.bound, dls.learn)
+        R, D, B = settings.learner(state.R, state.D, state.B, model.mu[:, None], settings.learn != "fixed")
         codes_after = [Codes.of(b) for b in _rows(B, self._alone(D))]
-        pays = None if bare is None else codes_pay(bare, _inside(R, model), B, model.mu, dls.threshold)
+        pays = None if bare is None else codes_pay(bare, _inside(R, model), B, model.mu, settings.threshold)
         final = _inside(R, model) if pays is None else torch.where(pays, _inside(R, model), bare)  # type: ignore[arg-type]
         del state, B, bare
         slope_z, folded, leaves = self._through_step(patches.adjoint(final, gz.shape), gz)
@@ -262,7 +236,7 @@ class _Back(NamedTuple):
         with torch.enable_grad():
             leaves = [_leaf(t) for t in _tensors(self.run.model)]
             z, folded = _leaf(self.before.z), _leaf(folded)
-            new = self.run.dls.step(_with_tensors(self.run.model, iter(leaves)), z, folded)
+            new = update_height(_with_tensors(self.run.model, iter(leaves)), z, folded, self.run.settings)
             found = torch.autograd.grad(new, [z, folded, *leaves], gz, allow_unused=True)
         slope_z, slope_folded = (torch.zeros_like(z) if g is None else g for g in found[:2])
         return slope_z, slope_folded, list(found[2:])
@@ -306,12 +280,12 @@ class _Back(NamedTuple):
 
         Unless R was given, it stands for P z - D b, and its share is handed on to D and b.
         """
-        dls, D, alone = self.run.dls, self.before.D, self._alone(D1)
-        learner = dls.learner if isinstance(dls.learner, SoupDIL) else SoupDIL("block")
-        mu, found = self.run.model.mu[:, None].expand(-1, R.shape[-1]), []
+        settings, D, alone = self.run.settings, self.before.D, self._alone(D1)
+        learner = settings.learner if isinstance(settings.learner, SoupDIL) else SoupDIL("block")
+        mu, found = self.model.mu[:, None].expand(-1, R.shape[-1]), []
         R, pull = (t.mT if alone else t.mT.flatten(0, 1)[None] for t in (R, gR))
         mu = mu if alone else mu.flatten()[None]
-        options = dls.bound, dls.threshold, learner.order, learner.unused, dls.learn
+        options = settings.bound, settings.threshold, learner.order, learner.unused, settings.learn != "fixed"
         for i in range(len(D)):
             sweep = Sweep(D[i], codes[i], D1[i], codes_after[i], mu[i], *options)
             found.append(sweep.pull(R[i], pull[i], gD1[i], g_codes[i]))

@@ -19,12 +19,14 @@ _NORM, _LEAST_CUT = 0.0, 0.35
 _FACTORS = (1.0, 1.5, 2.25)  # of the noise of one sample: the thresholds that mu="auto" is chosen from
 
 
-def check_selectable(data_term: Integrator, learn: str) -> None:
+def check_selectable(data_term: Integrator, learn: str, mu: object) -> None:
     """ValueError for options with which the risk cannot be predicted."""
     if type(data_term) is not LeastSquares:
         raise ValueError(f"DLS: select=True predicts the risk of least squares, not of {type(data_term).__name__}")
     if learn == "shared":
         raise ValueError("DLS: select=True chooses per surface and does not go with learn='shared'")
+    if isinstance(mu, tuple):
+        raise ValueError("DLS: select=True chooses one threshold and does not go with a schedule of mu")
 
 
 def choose_threshold(model: Problem, automatic: bool, run: Callable[[Tensor, Tensor], Tensor]) -> Problem:

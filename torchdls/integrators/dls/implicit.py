@@ -267,7 +267,7 @@ class _System(NamedTuple):
         if not bool(result.converged.all()):
             warnings.warn(
                 f"DLS: the implicit derivative stopped after {self.setting.max_iter} iterations at a relative residual "
-                f"of {float(result.residual.max()):.1e}, above grad_tol={self.setting.tol:.1e}",
+                f"of {float(result.residual.max()):.1e}, above tol={self.setting.tol:.1e} of Implicit",
                 ConvergenceWarning,
                 stacklevel=2,
             )

@@ -1,8 +1,8 @@
-"""What DLS carries through its iterations, and how converged surfaces leave the batch."""
+"""What DLS carries through its iterations, and the cost of patches and codes."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,7 +19,8 @@ class Problem(NamedTuple):
     """The constants of one run.
 
     coverage (1 or N, 1, H, W) is counted within the mask; valid (N, n, L) marks the valid pixels of the patches; edges
-    are (v, w) where the data term keeps them, whatever the height.
+    are (v, w) where the data term keeps them, whatever the height; lam and mu are (N,). A schedule holds a threshold
+    for each iteration, and mu the last of them.
     """
 
     fields: Fields
@@ -30,10 +31,17 @@ class Problem(NamedTuple):
     noise: Tensor
     lam: Tensor
     mu: Tensor
+    schedule: tuple[float, ...] | None = None
 
-    def select(self, keep: Tensor) -> Problem:
-        """The model of some surfaces of the batch; what all share stays as it is."""
-        return Problem(*(_select(value, keep) for value in self))
+    def at(self, iteration: int) -> Problem:
+        """The problem with the threshold of an iteration, counted from 0."""
+        if self.schedule is None:
+            return self
+        return self._replace(mu=torch.full_like(self.mu, self.schedule[iteration]))
+
+    def changes_after(self, iteration: int) -> bool:
+        """Whether a later iteration has another threshold."""
+        return self.schedule is not None and len(set(self.schedule[iteration:])) > 1
 
 
 class State(NamedTuple):
@@ -45,44 +53,18 @@ class State(NamedTuple):
     D: Tensor
     B: Tensor
 
-    def select(self, keep: Tensor) -> State:
-        """The state of some surfaces of the batch."""
-        return State(*(_select(value, keep) for value in self))
 
-    def choose(self, active: Tensor, new: State) -> State:
-        """The new state where a surface is still active."""
-        pairs = zip(self, new, strict=True)
-        return State(*(n if len(n) < len(active) else torch.where(_over(active, n), n, o) for o, n in pairs))
+class End(NamedTuple):
+    """Where they ended: height, dictionary, codes."""
 
-
-class Finished(NamedTuple):
-    """Surfaces of the batch that stopped at the same iteration, and where."""
-
-    surfaces: Tensor
-    state: State
+    z: Tensor
+    D: Tensor
+    B: Tensor
 
 
-def _select(value: Any, keep: Tensor) -> Any:
-    """The surfaces where `keep` holds, in a tensor or in a tuple of them."""
-    if isinstance(value, Tensor):
-        return value[keep] if len(value) == len(keep) else value
-    if isinstance(value, Fields):
-        return Fields(*(_select(v, keep) for v in value))
-    return tuple(_select(v, keep) for v in value) if isinstance(value, tuple) else value
-
-
-def _over(active: Tensor, t: Tensor) -> Tensor:
-    return active.view(-1, *[1] * (t.ndim - 1))
-
-
-def merge(parts: list[Finished]) -> State:
-    """All surfaces in the order in which they came."""
-    if len(parts) == 1:
-        return parts[0].state
-    order = torch.cat([p.surfaces for p in parts]).argsort()
-    columns = zip(*(p.state for p in parts), strict=True)
-    # A dictionary that all share went through the parts as it was.
-    return State(*(c[0] if all(t is c[0] for t in c) else torch.cat(c)[order] for c in columns))
+def last_state(problem: Problem, state: State) -> End:
+    """What is kept of a state that iterates no more."""
+    return End(state.z, state.D, state.B)
 
 
 def patch_cost(R: Tensor, B: Tensor, mu: Tensor, valid: Tensor | None, rule: Threshold = "hard") -> Tensor:

@@ -1,7 +1,8 @@
-"""The options of DLS: what is allowed, and what "auto" stands for."""
+"""The options of DLS: what is allowed, and what words stand for."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -9,96 +10,85 @@ import torch
 from torch import Tensor, nn
 
 from torchdls._registry import LEARNERS
-from torchdls.dictionary.learners import DinoKat, Learner, SoupDIL
-from torchdls.dictionary.soup_dil import Order, Unused
-from torchdls.dictionary.thresholds import THRESHOLDS, Threshold
+from torchdls.dictionary.learners import DinoKat, FixedDictionary, Learner, SoupDIL
+from torchdls.integrators.dls.options import DERIVATIVES, HEIGHT_STEPS, Exact, Implicit, Proximal, Unroll, meant
 from torchdls.operators import Patches
 
 Learn = Literal["each", "shared", "fixed"]
-Grad = Literal["auto", "unroll", "implicit", "frozen_dictionary", "none"]
-
-_WORDS = {
-    "z_step": ("exact", "proximal"),
-    "order": ("atom", "block"),
-    "learn": ("each", "shared", "fixed"),
-    "unused": ("first", "keep"),
-    "threshold": THRESHOLDS,
-    "grad": ("auto", "unroll", "implicit", "frozen_dictionary", "none"),
-}
-_COUNTS = {"n_iter": 0, "n_sweeps": 1, "n_prox": 1}
+LEARN: tuple[Learn, ...] = ("each", "shared", "fixed")
+HeightStep = Literal["exact", "proximal"] | Exact | Proximal
+Derivative = Literal["auto", "unroll", "implicit", "frozen_dictionary", "none"] | Unroll | Implicit
 
 
-def check_options(*, bound: float, tol: float, z_tol: float, grad_tol: float, **options: Any) -> None:
-    """ValueError for a word that is unknown, or a number out of its range."""
-    for name, known in _WORDS.items():
-        if options[name] not in known:
-            raise ValueError(f"DLS: {name}={options[name]!r} is unknown; choose from {', '.join(map(repr, known))}")
-    for name, least in _COUNTS.items():
-        if not isinstance(options[name], int) or options[name] < least:
-            raise ValueError(f"DLS: {name}={options[name]!r} given, an integer of at least {least} is needed")
-    if not bound > 0 or not tol >= 0 or not z_tol > 0 or not grad_tol > 0:
-        positive = f"bound={bound!r}, z_tol={z_tol!r} and grad_tol={grad_tol!r} must be positive"
-        raise ValueError(f"DLS: {positive}, tol={tol!r} not negative")
+def check_run(n_iter: int, tol: float, mu: object) -> None:
+    """ValueError for a number of iterations or a tolerance out of its range, or a schedule of another length."""
+    if not isinstance(n_iter, int) or n_iter < 0:
+        raise ValueError(f"DLS: n_iter={n_iter!r} given, an integer of at least 0 is needed")
+    if not tol >= 0:
+        raise ValueError(f"DLS: tol={tol!r} given, a number of at least 0 is needed")
+    if isinstance(mu, tuple) and len(mu) != n_iter:
+        raise ValueError(f"DLS: mu has {len(mu)} values for n_iter={n_iter} iterations")
 
 
-def resolve_derivative(grad: Grad, learn: Learn, threshold: str, steady: bool, dictionary: Tensor) -> Grad:
-    """The kind of derivative that "auto" stands for, once the kind asked for is found to exist.
+def choose_height_step(height_step: HeightStep) -> Exact | Proximal:
+    """The height step that was named, or the one given."""
+    return meant("height_step", height_step, HEIGHT_STEPS, (Exact, Proximal))
+
+
+def choose_derivative(
+    derivative: Derivative, learn: Learn, threshold: str, steady: bool, dictionary: Tensor
+) -> Unroll | Implicit | None:
+    """The derivative that was named or given, once it is found to exist; what "auto" stands for.
 
     Args:
-        grad: what was asked for.
+        derivative: what was asked for.
         learn: whether the dictionary is learned.
         threshold: rule of the codes.
         steady: the data term is one quadratic, whatever the height.
         dictionary: the initial dictionary.
     """
     possible = steady and threshold != "firm"
-    if grad == "auto":
-        return "implicit" if learn == "fixed" and possible else "unroll"
-    if grad in ("implicit", "frozen_dictionary"):
-        if not possible:
-            what = "a quadratic data term and hard or soft thresholds"
-            raise ValueError(f"DLS: grad={grad!r} needs {what}; take grad='unroll'")
-        if (grad == "implicit") != (learn == "fixed"):
-            other = "'unroll' (exact) or 'frozen_dictionary'" if grad == "implicit" else "'implicit'"
-            raise ValueError(f"DLS: grad={grad!r} does not go with learn={learn!r}; take {other}")
-        if grad == "frozen_dictionary" and isinstance(dictionary, nn.Parameter):
-            raise ValueError("DLS: grad='frozen_dictionary' gives a trained dictionary no derivative; take 'unroll'")
-    return grad
+    automatic = Implicit() if learn == "fixed" and possible else Unroll()
+    found = meant("derivative", derivative, {"auto": automatic, **DERIVATIVES}, (Unroll, Implicit))
+    if not isinstance(found, Implicit):
+        return found
+    asked = f"DLS: derivative={derivative!r}"
+    if not possible:
+        what = "a data term that is one quadratic, and hard or soft thresholds"
+        raise ValueError(f"{asked} needs {what}; take derivative='unroll'")
+    if found.frozen_dictionary == (learn == "fixed"):
+        other = "'implicit'" if found.frozen_dictionary else "'unroll' (exact) or 'frozen_dictionary'"
+        raise ValueError(f"{asked} does not go with learn={learn!r}; take {other}")
+    if found.frozen_dictionary and isinstance(dictionary, nn.Parameter):
+        raise ValueError(f"{asked} gives a trained dictionary no derivative; take 'unroll'")
+    return found
 
 
-def choose_learner(
-    learner: str | Learner | None, order: Order, unused: Unused, threshold: Threshold, patches: Patches
-) -> Learner:
-    """The learner of that name for these patches, or the one given; None is SOUP-DIL with the other options."""
-    if learner is None or learner == "soup_dil":
-        return SoupDIL(order, unused, threshold)
+def choose_learner(learner: str | Learner, learn: Learn, patches: Patches) -> tuple[Learner, Learn]:
+    """The learner of that name for these patches, or the one given, and how it learns."""
     if isinstance(learner, str):
         if learner not in LEARNERS:
             raise ValueError(f"DLS: learner={learner!r} is unknown; choose from {', '.join(map(repr, LEARNERS))}")
         learner = LEARNERS[learner]()
     if not callable(learner):
         raise TypeError(f"DLS: learner is a {type(learner).__name__}, a name or a Learner is needed")
-    if getattr(learner, "threshold", "hard") != threshold:
-        raise ValueError(f"DLS: threshold={threshold!r} does not go with learner={learner!r}")
-    for name, value, default in (("order", order, "atom"), ("unused", unused, "first")):
-        if value not in (default, getattr(learner, name, default)):
-            raise ValueError(f"DLS: {name}={value!r} does not go with learner={learner!r}")
+    if learn not in LEARN:
+        raise ValueError(f"DLS: learn={learn!r} is unknown; choose from {', '.join(map(repr, LEARN))}")
+    if isinstance(learner, FixedDictionary):
+        if learn == "shared":
+            raise ValueError("DLS: learn='shared' does not go with a fixed dictionary")
+        return learner, "fixed"
+    if learn == "fixed" and isinstance(learner, SoupDIL | DinoKat):
+        idle = {name: getattr(learner, name) for name in ("order", "unused")}
+        if idle != {"order": "atom", "unused": "first"}:
+            given = ", ".join(f"{name}={value!r}" for name, value in idle.items())
+            raise ValueError(f"DLS: {given} of the learner have no effect with learn='fixed'; take FixedDictionary")
     if isinstance(learner, DinoKat) and learner.patch_size is None and isinstance(patches.size, tuple):
         learner = replace(learner, patch_size=patches.size)
-    return learner
+    return learner, learn
 
 
-def check_combination(*, learn: Learn, fixed: bool, n_prox: int, z_step: str, checkpoint: bool, grad: Grad) -> None:
-    """ValueError for an option that another one would leave without effect."""
-    if fixed and learn == "shared":
-        raise ValueError("DLS: learn='shared' does not go with a fixed dictionary")
-    if n_prox != 1 and z_step == "exact":
-        raise ValueError(f"DLS: n_prox={n_prox} does not go with z_step='exact'; take z_step='proximal'")
-    if checkpoint and grad != "unroll":
-        raise ValueError(f"DLS: checkpoint=True does not go with grad={grad!r}; take grad='unroll'")
-
-
-def register_setting(module: nn.Module, name: str, value: float | Tensor | str) -> None:
+def register_setting(module: nn.Module, name: str, value: object) -> None:
     """A tensor becomes a buffer, so that it moves with the module, unless it is a parameter already."""
     if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):
         module.register_buffer(name, value.detach().clone())
@@ -106,10 +96,18 @@ def register_setting(module: nn.Module, name: str, value: float | Tensor | str) 
         setattr(module, name, value)
 
 
-def check_strength(name: str, value: float | Tensor | str) -> float | Tensor | str:
-    """Lam or mu: "auto", a number or a tensor, neither negative nor NaN; mu may be infinite, lam may not."""
-    if not isinstance(value, str | int | float | Tensor):
+def check_strength(name: str, value: Any) -> float | Tensor | tuple[float, ...] | str:
+    """Lam or mu: "auto", a number or a tensor, neither negative nor NaN; mu may be infinite, lam may not.
+
+    mu may also be a sequence of numbers, one for each iteration, which becomes a tuple.
+    """
+    kinds = (str, int, float, Tensor, *((list, tuple) if name == "mu" else ()))
+    if not isinstance(value, kinds) or isinstance(value, bool):
         raise TypeError(f"DLS: {name} is a {type(value).__name__}, 'auto', a number or a tensor is needed")
+    if isinstance(value, list | tuple):
+        if not all(isinstance(v, int | float) and not isinstance(v, bool) and v >= 0 for v in value):
+            raise ValueError(f"DLS: {name}={value!r} given, a schedule of numbers of at least 0 is needed")
+        return tuple(map(float, value))
     if isinstance(value, str):
         known = value == "auto"
     else:
@@ -120,10 +118,12 @@ def check_strength(name: str, value: float | Tensor | str) -> float | Tensor | s
     return value
 
 
-def per_surface(name: str, value: float | Tensor | str, auto: Tensor) -> Tensor:
-    """Lam or mu as (N,): what was given, or what was found for "auto"."""
+def per_surface(name: str, value: float | Tensor | Sequence[float] | str, auto: Tensor) -> Tensor:
+    """Lam or mu as (N,): what was given, the last of a schedule, or what was found for "auto"."""
     if isinstance(value, str):
         return auto
+    if isinstance(value, list | tuple):
+        value = value[-1] if value else 0.0
     value = torch.as_tensor(value, dtype=auto.dtype, device=auto.device)
     if value.numel() not in (1, auto.numel()):
         raise ValueError(f"DLS: {name} {tuple(value.shape)} does not fit {auto.numel()} surfaces")
