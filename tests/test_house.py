@@ -24,7 +24,7 @@ MAY_IMPORT |= {
     "geometry": {"operators"},
     "surfaces": {"operators"},
     "metrics": {"operators", "geometry"},
-    "photometric": {"operators", "geometry"},
+    "photometric": {"operators", "solvers", "dictionary", "geometry"},
     "io": {"geometry"},
     "plot": {"geometry", "metrics"},
     "persistence": {"integrators"},

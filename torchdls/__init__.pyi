@@ -53,8 +53,10 @@ from .io import load_camera as load_camera
 from .io import load_field as load_field
 from .io import load_height as load_height
 from .io import load_mask as load_mask
+from .io import load_photographs as load_photographs
 from .io import save_height as save_height
 from .io import save_mesh as save_mesh
+from .io import save_normals as save_normals
 from .metrics import mean_absolute_depth_error as mean_absolute_depth_error
 from .metrics import mean_angular_error as mean_angular_error
 from .metrics import rmse as rmse
@@ -70,9 +72,16 @@ from .operators import idct2 as idct2
 from .persistence import build as build
 from .persistence import load as load
 from .persistence import save as save
+from .photometric import PHOTOMETRIC as PHOTOMETRIC
 from .photometric import PhotometricResult as PhotometricResult
+from .photometric import RefineResult as RefineResult
+from .photometric import bivariate_normals as bivariate_normals
 from .photometric import cast_shadows as cast_shadows
+from .photometric import dlnv_normals as dlnv_normals
+from .photometric import dlpi_normals as dlpi_normals
+from .photometric import lights_from_ball as lights_from_ball
 from .photometric import low_rank_normals as low_rank_normals
+from .photometric import refine as refine
 from .photometric import render as render
 from .photometric import ring_of_lights as ring_of_lights
 from .photometric import sparse_normals as sparse_normals

@@ -1,4 +1,4 @@
-"""The integrators and learners by name, without loading any: a name costs nothing until its class is asked for."""
+"""Integrators, learners and photometric methods by name, without loading any: a name costs nothing until it is used."""
 
 from __future__ import annotations
 
@@ -33,6 +33,10 @@ class Registry(Mapping[str, type[T]]):
         module, _, attribute = self._classes[name].rpartition(".")
         found: type[T] = getattr(import_module(module or "torchdls"), attribute)
         return found
+
+    def find(self, name: str) -> Any:
+        """As [name], for tables of functions."""
+        return self[name]
 
     def __contains__(self, name: object) -> bool:
         return name in self._classes
@@ -88,5 +92,16 @@ LEARNERS: Registry[Learner] = Registry(
         "fixed": "FixedDictionary",
         "dino_kat": "DinoKat",
         "unitary": "Unitary",
+    }
+)
+
+PHOTOMETRIC: Registry[Any] = Registry(
+    {
+        "woodham": "woodham",
+        "low_rank": "low_rank_normals",
+        "sparse": "sparse_normals",
+        "bivariate": "bivariate_normals",
+        "dlpi": "dlpi_normals",
+        "dlnv": "dlnv_normals",
     }
 )

@@ -7,6 +7,7 @@ import torch
 import torchdls
 from tests.helpers import assert_gradients, assert_unchanged, random_field, seeded
 from torchdls import (
+    PHOTOMETRIC,
     SURFACES,
     cast_shadows,
     gradient_to_normals,
@@ -18,7 +19,7 @@ from torchdls import (
 )
 from torchdls.photometric.low_rank import robust_pca, shrink_singular_values
 
-METHODS = [woodham, low_rank_normals, sparse_normals]
+METHODS = [PHOTOMETRIC.find(name) for name in PHOTOMETRIC]
 
 
 def two_rings(dtype=torch.float64):

@@ -1,4 +1,4 @@
-"""The command line: `torchdls demo`, `torchdls integrate`, `torchdls methods`.
+"""The command line: `torchdls integrate`, `torchdls photometric`, `torchdls demo`, `torchdls methods`.
 
 PyTorch is imported when a command runs, so `torchdls --help` answers at once. Whatever is wrong with a file or an
 argument is one line on standard error and exit status 2; output files are written whole or not at all.
@@ -17,6 +17,7 @@ from torchdls import __version__
 from torchdls.cli.demo import add_demo
 from torchdls.cli.integrate import add_integrate
 from torchdls.cli.methods import list_methods
+from torchdls.cli.photometric import add_photometric
 
 if TYPE_CHECKING:
     pass
@@ -28,6 +29,7 @@ examples:
   torchdls integrate normals.png --convention directx --mask mask.png -o surface.ply -o height.tiff
   torchdls integrate gradient.npz --method least_squares -o height.npz
   torchdls integrate normals.png --convention opencv --camera K.txt -o depth.tiff
+  torchdls photometric photographs --normals normals.png -o surface.ply
 """
 
 
@@ -79,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"torchdls {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     add_integrate(commands)
+    add_photometric(commands)
     add_demo(commands)
     methods = commands.add_parser("methods", help="list the methods", description="List the methods and their options.")
     methods.set_defaults(run=list_methods)

@@ -27,10 +27,10 @@ def list_methods(arguments: argparse.Namespace) -> None:
         print(textwrap.fill(options, 110, initial_indent=indent, subsequent_indent=indent))
 
 
-def check_method(name: str, settings: Sequence[str] = ()) -> None:
+def check_method(name: str, settings: Sequence[str] = (), option: str = "--method") -> None:
     """ValueError, in the words of the command line, for a method or options that cannot be used."""
     if name not in INTEGRATORS:
-        raise ValueError(f"--method: {name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
+        raise ValueError(f"{option}: {name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
     known = {key: default for key, default in INTEGRATORS.parameters(name).items() if key != "pixel_size"}
     for key, value in _options(settings).items():
         if key == "pixel_size":
@@ -77,9 +77,11 @@ def _options(settings: Sequence[str]) -> dict[str, Any]:
     return options
 
 
-def build_method(name: str, pixel_size: tuple[float, float], settings: Sequence[str] = ()) -> Integrator:
+def build_method(
+    name: str, pixel_size: tuple[float, float], settings: Sequence[str] = (), option: str = "--method"
+) -> Integrator:
     """The integrator of that name, with options given as words `name=value`."""
-    check_method(name, settings)
+    check_method(name, settings, option)
     return INTEGRATORS[name](pixel_size=pixel_size, **_options(settings))
 
 

@@ -3,15 +3,20 @@
 from torchdls.io.fields import Field, load_camera, load_field, load_mask
 from torchdls.io.heights import OUTPUT_SUFFIXES, HeightMap, load_height, save_height
 from torchdls.io.meshes import save_mesh
+from torchdls.io.photographs import NORMAL_SUFFIXES, Photographs, load_photographs, save_normals
 
 __all__ = [
     "Field",
     "HeightMap",
+    "NORMAL_SUFFIXES",
     "OUTPUT_SUFFIXES",
+    "Photographs",
     "load_camera",
     "load_field",
     "load_height",
     "load_mask",
+    "load_photographs",
     "save_height",
     "save_mesh",
+    "save_normals",
 ]
