@@ -9,6 +9,7 @@ from tests.helpers import DISK, random_field, seeded
 from torchdls import (
     SURFACES,
     Patches,
+    SoupDIL,
     dlnv_normals,
     dlpi_normals,
     gradient_to_normals,
