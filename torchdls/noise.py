@@ -12,6 +12,7 @@ from torchdls._statistics import NORMAL_MEDIAN
 from torchdls._tracing import holds_everywhere
 from torchdls.operators import as_pixel_size, dst2, edge_slopes
 from torchdls.operators.cosine import cosine_matrix
+from torchdls.operators.edges import cell_curl, cell_edges
 from torchdls.operators.sine import squared_sines
 from torchdls.operators.tables import table
 
@@ -87,7 +88,7 @@ def noise_level(
         mask, weight = (None if t is None else t[None] for t in (mask, weight))
     _check(gradient, mask, weight)
     v, w = edge_slopes(gradient, mask, weight)
-    curl = _curl(v, dx, dy)
+    curl = cell_curl(v, (dx, dy))
     scale = math.hypot(dx, dy)
     if w is None:
         sigma = torch.minimum(_robust_scale(curl / scale), _spectral_scale(curl, dx, dy))
@@ -98,20 +99,13 @@ def noise_level(
     return sigma[0] if single else sigma
 
 
-def _curl(v: Tensor, dx: float, dy: float) -> Tensor:
-    """(N, H - 1, W - 1) sums of the slopes around the cells."""
-    x, y = v[:, 0, :, :-1] * dx, v[:, 1, :-1] * dy
-    return x[:, :-1] - x[:, 1:] + y[:, :, 1:] - y[:, :, :-1]
-
-
 def _normalised(curl: Tensor, w: Tensor, dx: float, dy: float) -> tuple[Tensor, Tensor]:
     """The curl over its standard deviation for sigma = 1, and the cells whose four edges all count.
 
     An edge of weight w_e = (t_i + t_j)/2 averages samples of variance sigma^2/t: its slope has variance
     sigma^2/(2 w_e).
     """
-    x, y = w[:, 0, :, :-1], w[:, 1, :-1]
-    edges = torch.stack([x[:, :-1], x[:, 1:], y[:, :, 1:], y[:, :, :-1]], 1)
+    edges = cell_edges(w)
     cells = (edges > 0).all(1)
     if not holds_everywhere(cells.flatten(1).any(1)):
         raise ValueError("noise_level: a mask (or the positive weights) holds no complete cell of 2 x 2 pixels")

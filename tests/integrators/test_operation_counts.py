@@ -70,10 +70,10 @@ def test_an_iteration_of_the_masked_solve():
     counts, steps = [], []
     for tol in (1e-2, 1e-5):
         method = LeastSquares(tol=tol)
-        fields = method.check(g, inside)
-        method.solve_fields(fields)  # fills the tables of this size, whose making would hide a part of the steps
+        fields = method._check_fields(g, inside)
+        method._solve_fields(fields)  # fills the tables of this size, whose making would hide a part of the steps
         with Operations(large=g.numel() // 4) as seen:
-            steps.append(int(method.solve_fields(fields).iterations))
+            steps.append(int(method._solve_fields(fields).iterations))
         counts.append(seen)
     more = steps[1] - steps[0]
     assert more >= 3

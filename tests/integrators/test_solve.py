@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tests.helpers import uniform_field
 from tests.helpers.methods import bumps, everything, method
@@ -58,7 +58,7 @@ class Direct(Integrator):
 
     accepts = frozenset()
 
-    def integrate(self, fields: Fields) -> Tensor:
+    def _integrate(self, fields: Fields) -> Tensor:
         return solve_direct(slope_divergence(fields.gradient, fields.steps), None, fields.steps)
 
 
@@ -87,3 +87,45 @@ def test_what_is_missing_is_said_when_it_is_made() -> None:
         Nothing()  # type: ignore[abstract]
     with pytest.raises(TypeError, match=r"NoTerm.*data_term"):
         NoTerm(n_iter=1, tol=0)  # type: ignore[abstract]
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_shows_what_a_user_calls_alone(name: str) -> None:
+    """Beside what every module has: the call, `solve`, options, and those of the method itself."""
+    integrator = method(name).build(name)
+    own = {n for n in dir(integrator) if not n.startswith("_")} - set(dir(nn.Module()))
+    options = set(INTEGRATORS.parameters(name)) | {"accepts", "options", "solve"}
+    more = {
+        "dls": {"patches"},
+        "slope_dls": {"fast"},
+        "weighted_least_squares": {"boundary"},
+        "mumford_shah": {"indicator"},
+    }
+    assert own - options == more.get(name, set())
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_the_data_term_is_what_it_says(name: str) -> None:
+    """One quadratic, or one that follows the height; methods without one say so."""
+    integrator, g = method(name).build(name), bumps(2)
+    fields = integrator._check_fields(g)
+    if integrator._steady is None:
+        with pytest.raises(TypeError, match="not built on the solve"):
+            integrator._data_term(fields)
+        with pytest.raises(ValueError, match="not built on the weighted solve"):
+            DLS(data_term=integrator)
+        return
+    data = integrator._data_term(fields)
+    assert data.steady == integrator._steady
+    one, other = (data.majoriser(height) for height in (g[:, :1], 3 * g[:, 1:]))
+    same = torch.equal(one[0], other[0]) and (one[1] is None or torch.equal(one[1], other[1]))
+    assert same == data.steady
+
+
+def test_a_class_with_the_old_name_of_the_hook_is_refused() -> None:
+    class Old(Integrator):
+        def integrate(self, fields: Fields) -> Tensor:
+            return fields.gradient[:, :1]
+
+    with pytest.raises(TypeError, match="_integrate"):
+        Old()  # type: ignore[abstract]

@@ -15,10 +15,10 @@ from torch.nn.utils import parametrize
 from torchdls._checks import check_field, require
 from torchdls._options import plain, same, shown
 from torchdls._tracing import all_finite
-from torchdls.integrators.data_term import edge_cost
+from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.fields import Fields as Fields
 from torchdls.integrators.fields import check_accepted, check_values, fit_fields, within_mask
-from torchdls.operators import as_pixel_size, edge_slopes
+from torchdls.operators import as_pixel_size
 
 Callback = Callable[[int, Tensor], None]
 
@@ -45,9 +45,8 @@ class IntegrationResult(NamedTuple):
 class Integrator(nn.Module, ABC):
     """A method that turns gradients into heights.
 
-    A new method is one short class with `integrate`. If it is an outer loop around the solve (*), it also says how
-    its data term looks as a quadratic around a height (`edges`) and what it costs (`data_cost`), and so serves as
-    `data_term` of DLS.
+    A new method is one short class with `_integrate`. If it is built on the solve (*), it also gives its data term
+    (`_data_term`) and says whether that is one quadratic (`_steady`), and so serves as `data_term` of DLS.
 
     A method that cannot honour a mask, weights or anchors leaves them out of `accepts`; a call that brings one then
     raises a ValueError, rather than a surface that ignores it.
@@ -57,7 +56,7 @@ class Integrator(nn.Module, ABC):
 
     Example:
         >>> class Flat(torchdls.Integrator):  # whatever the slopes are
-        ...     def integrate(self, fields):
+        ...     def _integrate(self, fields):
         ...         return torch.zeros_like(fields.gradient[:, :1])
         >>> Flat()(torch.ones(1, 2, 4, 5)).shape
         torch.Size([1, 1, 4, 5])
@@ -66,9 +65,9 @@ class Integrator(nn.Module, ABC):
     # Which of the optional arguments of `forward` the method honours.
     accepts: frozenset[str] = frozenset({"mask", "weight", "anchor"})
 
-    # Whether the method is built on the solve (*), so that `edges` and `data_cost` describe it and it can serve as a
-    # data term.
-    quadratic: bool = False
+    # Of methods built on the solve (*), whether their data term is one quadratic, whatever the height; None for others,
+    # which have no data term.
+    _steady: bool | None = None
 
     def __init__(self, *, pixel_size: float | Sequence[float] = 1.0) -> None:
         super().__init__()
@@ -102,9 +101,9 @@ class Integrator(nn.Module, ABC):
                 (see `accepts`), or the height is beyond what its dtype can hold. The message names the argument and
                 the shapes.
         """
-        fields = self.check(gradient, mask, weight, anchor, anchor_weight)
-        height = self.integrate(fields)
-        height = self._finite(height if self.unit == 1 else height * self.unit)
+        fields = self._check_fields(gradient, mask, weight, anchor, anchor_weight)
+        height = self._integrate(fields)
+        height = self._finite(height if self._unit == 1 else height * self._unit)
         return height if gradient.ndim == 4 else height[0]
 
     if TYPE_CHECKING:  # the call of `nn.Module` gives Any
@@ -145,7 +144,7 @@ class Integrator(nn.Module, ABC):
         return f"{kind.__name__}({', '.join(f'{name}={shown(arguments[name])}' for name in told)})"
 
     @abstractmethod
-    def integrate(self, fields: Fields) -> Tensor:
+    def _integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels from checked fields; what a subclass provides."""
 
     def solve(
@@ -176,23 +175,19 @@ class Integrator(nn.Module, ABC):
             TypeError: as `forward`.
             ValueError: as `forward`.
         """
-        fields = self.check(gradient, mask, weight, anchor, anchor_weight)
-        result = self.told(fields)
-        return result._replace(height=self._finite(result.height * self.unit))
+        fields = self._check_fields(gradient, mask, weight, anchor, anchor_weight)
+        result = self._report(fields)
+        return result._replace(height=self._finite(result.height * self._unit))
 
-    def told(self, fields: Fields) -> IntegrationResult:
+    def _report(self, fields: Fields) -> IntegrationResult:
         """The height in pixels from checked fields, and how it went; a method that iterates says so."""
-        height = self.integrate(fields)
+        height = self._integrate(fields)
         iterations = torch.zeros(len(height), dtype=torch.int64, device=height.device)
         return IntegrationResult(height, iterations, iterations == 0)
 
-    def edges(self, fields: Fields, z: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
-        """Slopes v and trusts w of the quadratic 1/2 sum w (A z - v)^2 that stands for the data term around z."""
-        return edge_slopes(fields.gradient, fields.mask, fields.weight)
-
-    def data_cost(self, fields: Fields, z: Tensor) -> Tensor:
-        """(N,) the data term at z."""
-        return edge_cost(z, *self.edges(fields), fields.steps)
+    def _data_term(self, fields: Fields) -> DataTerm:
+        """The data term of checked fields; what methods built on the solve (*) provide."""
+        raise TypeError(f"{type(self).__name__} has no data term: it is not built on the solve")
 
     def _finite(self, height: Tensor) -> Tensor:
         """The height, if the numbers of its dtype reach so far."""
@@ -203,11 +198,11 @@ class Integrator(nn.Module, ABC):
         return height
 
     @property
-    def unit(self) -> float:
+    def _unit(self) -> float:
         """Side h = sqrt(dx dy) of a square pixel of the same area: the height that is 1 inside the solvers."""
         return sqrt(self.pixel_size[0] * self.pixel_size[1])
 
-    def check(
+    def _check_fields(
         self,
         gradient: Tensor,
         mask: Tensor | None = None,
@@ -221,7 +216,7 @@ class Integrator(nn.Module, ABC):
         check_field(name, "gradient", gradient, 2)
         fields = within_mask(name, fit_fields(name, gradient, mask, weight, anchor, anchor_weight))
         check_values(name, fields)
-        h = self.unit
+        h = self._unit
         return fields._replace(
             anchor=None if fields.anchor is None else fields.anchor / h,
             anchor_weight=None if fields.anchor_weight is None else fields.anchor_weight * h**2,

@@ -2,27 +2,64 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
-from torchdls.operators import GradientOperator
+from torchdls.integrators.fields import Fields
+from torchdls.operators import GradientOperator, edge_slopes
 
 
 class DataTerm(Protocol):
-    """A data term bound to its fields, as a function of the height."""
+    """A data term bound to its fields, as a function of the height.
+
+    A named tuple of tensors whose first dimension is the batch (or 1), so that surfaces can leave the batch.
+    """
+
+    @property
+    def steady(self) -> bool:
+        """Whether the majoriser is the data term itself: one quadratic, whatever the height."""
 
     def cost(self, z: Tensor) -> Tensor:
         """(N,) its value at z."""
 
-    def majoriser(self, z: Tensor) -> tuple[Tensor, Tensor]:
+    def majoriser(self, z: Tensor) -> tuple[Tensor, Tensor | None]:
         """Slopes v and trusts w (N, 2, H, W) of a quadratic that touches the data term at z and is nowhere below it.
 
-        The quadratic is 1/2 sum w (A . - v)^2, but for a constant.
+        The quadratic is 1/2 sum w (A . - v)^2, but for a constant; None stands for trusts of 1.
         """
 
 
-def edge_cost(z: Tensor, v: Tensor, w: Tensor | None, steps: tuple[float, float]) -> Tensor:
-    """(N,) 1/2 sum w (A z - v)^2."""
-    misfit = (GradientOperator("forward", steps)(z) - v).square()
-    return 0.5 * (misfit if w is None else w * misfit).sum((-3, -2, -1))
+class Quadratic(NamedTuple):
+    """1/2 sum w (A z - v)^2: the data term of least squares, and of all whose trusts do not depend on the height."""
+
+    v: Tensor
+    w: Tensor | None
+    steps: tuple[float, float]
+
+    @classmethod
+    def of(cls, fields: Fields) -> Quadratic:
+        """That of least squares: slopes and trusts of the edges."""
+        return cls(*edge_slopes(fields.gradient, fields.mask, fields.weight), fields.steps)
+
+    @property
+    def steady(self) -> bool:
+        """Always."""
+        return True
+
+    def cost(self, z: Tensor) -> Tensor:
+        """(N,) its value at z."""
+        misfit = (GradientOperator("forward", self.steps)(z) - self.v).square()
+        return 0.5 * (misfit if self.w is None else self.w * misfit).sum((-3, -2, -1))
+
+    def majoriser(self, z: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Itself."""
+        return self.v, self.w
+
+
+def anchored_cost(data: DataTerm, fields: Fields, z: Tensor) -> Tensor:
+    """(N,) data term and anchors at z."""
+    cost = data.cost(z)
+    if fields.anchor is not None and fields.anchor_weight is not None:
+        cost = cost + 0.5 * (fields.anchor_weight * (z - fields.anchor).square()).sum((-3, -2, -1))
+    return cost

@@ -106,16 +106,16 @@ def fit_field(
     return field.expand(gradient.shape[0] if gradient.ndim == 4 else 1, -1, -1, -1)
 
 
-def even(fields: Fields, weight: Tensor | None = None) -> Tensor:
+def has_even_trust(fields: Fields, weight: Tensor | None = None) -> Tensor:
     """(N, 1, 1, 1) bool: a full rectangle with equal trust and no anchor, where the noise of the height is known."""
     full = torch.ones_like(fields.gradient[:, :1, :1, :1], dtype=torch.bool)
     if fields.mask is not None:
-        full = full & (largest(~fields.mask) == 0)
+        full = full & (largest_per_surface(~fields.mask) == 0)
     for w in (fields.weight, weight):
-        full = full if w is None else full & (largest(w) == -largest(-w))
-    return full if fields.anchor_weight is None else full & (largest(fields.anchor_weight) == 0)
+        full = full if w is None else full & (largest_per_surface(w) == -largest_per_surface(-w))
+    return full if fields.anchor_weight is None else full & (largest_per_surface(fields.anchor_weight) == 0)
 
 
-def largest(x: Tensor) -> Tensor:
+def largest_per_surface(x: Tensor) -> Tensor:
     """(N, 1, 1, 1), the largest value of each surface."""
     return x.flatten(1).amax(1)[:, None, None, None]

@@ -23,19 +23,19 @@ Result = TypeVar("Result", bound=HasHeight)
 
 
 class Iterative(Integrator, Generic[Result]):
-    """An integrator that iterates; a subclass provides `iterate` and `in_units`, and says what its result holds."""
+    """An integrator that iterates; a subclass provides `_iterate` and `_in_units`, and says what its result holds."""
 
     @abstractmethod
-    def iterate(self, fields: Fields, callback: Callback | None = None) -> Result:
+    def _iterate(self, fields: Fields, callback: Callback | None = None) -> Result:
         """The result from checked fields, with heights in pixels."""
 
     @abstractmethod
-    def in_units(self, result: Result) -> Result:
+    def _in_units(self, result: Result) -> Result:
         """The result with its heights, and what else has their unit, in the unit of `pixel_size`."""
 
-    def integrate(self, fields: Fields) -> Tensor:
+    def _integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
-        return self.iterate(fields).height
+        return self._iterate(fields).height
 
     def solve(
         self,
@@ -65,5 +65,5 @@ class Iterative(Integrator, Generic[Result]):
             TypeError: as `forward`.
             ValueError: as `forward`.
         """
-        fields = self.check(gradient, mask, weight, anchor, anchor_weight)
-        return self.in_units(self.iterate(fields, callback))
+        fields = self._check_fields(gradient, mask, weight, anchor, anchor_weight)
+        return self._in_units(self._iterate(fields, callback))

@@ -150,16 +150,43 @@ def _pair_both(inside: Tensor) -> Tensor:
 
 def present_edges(v: Tensor) -> Tensor:
     """Weight 1 on every edge of the rectangle, 0 beyond its last column and row."""
-    w = torch.ones_like(v)
-    w[:, 0, :, -1] = 0
-    w[:, 1, -1, :] = 0
-    return w
+    ones = torch.ones_like(v[..., :1, :, :])
+    return _stack_edges(ones[..., :, :-1], ones[..., :-1, :])
+
+
+def edges_at_pixels(field: Tensor) -> Tensor:
+    """Sum of an edge field over the two edges at each pixel, the one ahead and the one behind: (.., 2, H, W)."""
+    x, y = field.split(1, -3)
+    return field + torch.cat([F.pad(x[..., :, :-1], (1, 0)), F.pad(y[..., :-1, :], (0, 0, 1, 0))], -3)
 
 
 def edge_ends(w: Tensor) -> Tensor:
     """(N, 1, H, W): sum of an edge field over the (up to four) edges at each pixel."""
     x, y = w.split(1, -3)
     return x + y + F.pad(x[..., :, :-1], (1, 0)) + F.pad(y[..., :-1, :], (0, 0, 1, 0))
+
+
+def cell_curl(v: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
+    """(N, H - 1, W - 1): sums of the slopes v, times their lengths, around each cell of 2 x 2 pixels."""
+    x, y = v[:, 0, :, :-1] * pixel_size[0], v[:, 1, :-1] * pixel_size[1]
+    return x[:, :-1] - x[:, 1:] + y[:, :, 1:] - y[:, :, :-1]
+
+
+def cell_edges(field: Tensor) -> Tensor:
+    """(N, 4, H - 1, W - 1): the edge field on the top, bottom, right and left edges of each cell of 2 x 2 pixels."""
+    x, y = field[:, 0, :, :-1], field[:, 1, :-1]
+    return torch.stack([x[:, :-1], x[:, 1:], y[:, :, 1:], y[:, :, :-1]], 1)
+
+
+def complete_cells(live: Tensor) -> Tensor:
+    """(N, H - 1, W - 1) bool: the cells that have all four edges."""
+    return cell_edges(live).all(1)
+
+
+def beside_edges(cells: Tensor) -> Tensor:
+    """Sum of a cell field (N, H - 1, W - 1) over the (one or two) cells beside each edge: (N, 2, H, W)."""
+    low = F.pad(cells, (0, 1, 0, 1))
+    return torch.stack([low + F.pad(cells, (0, 1, 1, 0)), low + F.pad(cells, (1, 0, 0, 1))], 1)
 
 
 def extend_edges(field: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_fit, check_real
-from torchdls._statistics import NORMAL_MEDIAN
+from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls._tracing import holds_everywhere
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # the entries of a symmetric 3 x 3 matrix that are kept
@@ -170,8 +170,7 @@ def _confidence(b: Tensor, albedo: Tensor, samples: Samples) -> Tensor:
 def _scale(residual: Tensor, images: Tensor, known: Tensor) -> Tensor:
     """(N, 1, 1, 1) robust deviation of the residuals, at least a thousandth of the rms of the images; 1 if all is 0."""
     count = known.sum((-3, -2, -1)).clamp(min=1)
-    magnitude = torch.where(known, residual.abs(), torch.nan).flatten(1)
-    scale = magnitude.nanmedian(1).values.nan_to_num(0.0) / NORMAL_MEDIAN
+    scale = masked_median(residual.abs().flatten(1), known.flatten(1)) / NORMAL_MEDIAN
     power = torch.where(known, images.square(), 0).sum((-3, -2, -1)) / count
     least = torch.where(power > 0, 1e-3 * torch.where(power > 0, power, 1).sqrt(), 1)
     return torch.maximum(scale, least)[:, None, None, None]

@@ -194,7 +194,7 @@ def test_a_schedule_is_one_threshold_after_the_other(given):
     found = DLS(**{**SMALL, "n_iter": 4}, lam=0.5, mu=mus, height_step=Exact(1e-12)).solve(g, **given)
     assert found.mu.tolist() == [0.3, 0.3]
     dls = DLS(**SMALL, lam=0.5, mu=1.0, height_step=Exact(1e-12))
-    fields = dls.check(g, **given)
+    fields = dls._check_fields(g, **given)
     problem, settings = dls._problem(fields, noise_level(g, **given)), dls._settings
     state = start(problem, dls._initial_dictionary(fields), settings)
     costs = []
@@ -217,7 +217,7 @@ def test_accelerated_steps_are_those_of_nesterov():
     """Against the same recursion on the dense normal equations; and they get further than plain ones."""
     g = field()
     dls = DLS(**SMALL, lam=0.5, mu=0.5)
-    problem, settings = dls._problem(dls.check(g), noise_level(g)), dls._settings
+    problem, settings = dls._problem(dls._check_fields(g), noise_level(g)), dls._settings
     state = start(problem, dls._initial_dictionary(problem.fields), settings)
     a = GradientOperator()
     M = torch.func.jacrev(lambda z: a(z.view(1, 1, H, W)).flatten())(torch.zeros(H * W, dtype=g.dtype))

@@ -7,7 +7,17 @@ import torch
 from torch import Tensor
 
 from tests.helpers import random_field
-from torchdls import DLS, Exact, FixedDictionary, Implicit, LeastSquares, Unroll, dct_dictionary
+from torchdls import (
+    DLS,
+    Exact,
+    FixedDictionary,
+    Huber,
+    Implicit,
+    LeastSquares,
+    Unroll,
+    WeightedLeastSquares,
+    dct_dictionary,
+)
 
 H, W = 9, 8
 MASK = torch.ones(1, 1, H, W, dtype=torch.bool)
@@ -153,3 +163,22 @@ def test_automatic_mode() -> None:
     assert DLS(learn="fixed")._derivative == DLS(learner="fixed")._derivative == Implicit()
     assert DLS()._derivative == DLS(learner=FixedDictionary("firm"))._derivative == Unroll()
     assert DLS(derivative="none")._derivative is None
+
+
+def test_trusts_that_do_not_depend_on_the_height_have_an_implicit_derivative() -> None:
+    """Weighted least squares as data term: as unrolled to the end, the trusts' own derivative included."""
+    g, c = random_field(1, 2, H, W), random_field(1, 1, H, W, seed=9)
+    slopes = []
+    for derivative, options in ((IMPLICIT, {}), ("unroll", {"n_iter": 300, "tol": 0.0})):
+        settings: dict[str, Any] = {"patch_size": 3, "n_atoms": 9, "lam": 0.3, "mu": 0.8, "n_iter": 6000, "tol": 1e-9}
+        data = WeightedLeastSquares(tol=1e-13)
+        model = DLS(
+            data_term=data, learner="fixed", height_step=Exact(1e-12), derivative=derivative, **settings | options
+        )
+        point = g.clone().requires_grad_()
+        height = centred(model(point), None)
+        slopes.append(torch.autograd.grad((height * c).sum(), point)[0])
+    torch.testing.assert_close(*slopes, rtol=1e-5, atol=1e-6)
+    assert DLS(learner="fixed", data_term=WeightedLeastSquares())._derivative == Implicit()
+    with pytest.raises(ValueError, match="one quadratic"):
+        DLS(learner="fixed", data_term=Huber(), derivative="implicit")

@@ -129,8 +129,8 @@ def test_total_variation_is_the_minimum_that_scipy_finds(masked):
     k, v, t = (np.array([[row[part] for row in pair] for pair in pairs]) for part in range(3))
     t = t.max(1)
     method = TotalVariation(n_iter=300, tol=1e-11, solve_tol=1e-9)
-    fields = method.check(g[None], *(None if f is None else f[None] for f in (mask, weight)))
-    penalty = method.data_term(fields)
+    fields = method._check_fields(g[None], *(None if f is None else f[None] for f in (mask, weight)))
+    penalty = method._data_term(fields)
     strength, corner = float(penalty.strength), float(penalty.corner)
 
     def cost(z):
@@ -151,9 +151,9 @@ def test_anchors_and_pixel_size_reach_a_stationary_point(method):
     g, mask, weight = small_problem(True, True, channels=1)
     anchor, trust = random_field(1, 6, 7, seed=6), random_field(1, 6, 7, seed=7).square()
     method.n_iter, method.tol, method.solve_tol, method.pixel_size = 300, 1e-12, 1e-8, (0.5, 1.5)
-    fields = method.check(*(None if f is None else f[None] for f in (g, mask, weight, anchor, trust)))
-    z = method.integrate(fields).requires_grad_()
-    cost = method.data_cost(fields, z) + (fields.anchor_weight * (z - fields.anchor).square()).sum() / 2
+    fields = method._check_fields(*(None if f is None else f[None] for f in (g, mask, weight, anchor, trust)))
+    z = method._integrate(fields).requires_grad_()
+    cost = method._data_term(fields).cost(z) + (fields.anchor_weight * (z - fields.anchor).square()).sum() / 2
     (slope,) = torch.autograd.grad(cost.sum(), z)
     assert slope.abs().max() < 1e-4
 
@@ -186,9 +186,9 @@ def test_majoriser_touches_and_is_nowhere_below(make, mask):
     method = make(pixel_size=(0.8, 1.25))
     mask = None if mask is None else MASKS[mask](9, 10)
     weight = random_field(1, 1, 9, 10, seed=1).square()
-    fields = method.check(random_field(1, 2, 9, 10), mask, weight)
+    fields = method._check_fields(random_field(1, 2, 9, 10), mask, weight)
     z0 = random_field(1, 1, 9, 10, seed=5)
-    v, w = method.edges(fields, z0)
+    v, w = method._data_term(fields).majoriser(z0)
 
     def quadratic(z):
         slopes = torch.zeros_like(v)
@@ -196,15 +196,15 @@ def test_majoriser_touches_and_is_nowhere_below(make, mask):
         slopes[:, 1, :-1] = z[:, 0].diff(dim=-2) / 1.25
         return (w * (slopes - v).square()).sum((1, 2, 3)) / 2
 
-    h = method.unit
+    h = method._unit
     assert h == pytest.approx(1.0)
-    base = method.data_cost(fields, z0) - quadratic(z0)
+    base = method._data_term(fields).cost(z0) - quadratic(z0)
     for seed in range(20):
         z = z0 + 10.0 ** (seed % 4 - 2) * random_field(1, 1, 9, 10, seed=10 + seed)
-        above = quadratic(z) + base - method.data_cost(fields, z)
+        above = quadratic(z) + base - method._data_term(fields).cost(z)
         assert above > -1e-8
     small = z0 + 1e-7 * random_field(1, 1, 9, 10, seed=99)
-    torch.testing.assert_close(quadratic(small) + base, method.data_cost(fields, small), rtol=0, atol=1e-9)
+    torch.testing.assert_close(quadratic(small) + base, method._data_term(fields).cost(small), rtol=0, atol=1e-9)
 
 
 def test_reweighting_never_raises_the_objective(make):
@@ -239,7 +239,7 @@ def test_weighted_least_squares_distrusts_the_curl():
     g[0, :, 10::12, 10::12] += 20
     assert rmse(WeightedLeastSquares()(g), surface.height) < 0.2 * rmse(LeastSquares()(g), surface.height)
     method = WeightedLeastSquares()
-    _, w = method.edges(method.check(surface.gradient.new_ones(1, 2, 5, 6)))  # a plane is all integrable
+    w = method._data_term(method._check_fields(surface.gradient.new_ones(1, 2, 5, 6))).w  # a plane is all integrable
     torch.testing.assert_close(w[:, 0, :, :-1], torch.full_like(w[:, 0, :, :-1], 1.03))
     assert (w[:, 0, :, -1] == 0).all()
     assert (w[:, 1, -1] == 0).all()
@@ -316,8 +316,8 @@ def test_derivative_of_weighted_least_squares():
 def test_anisotropic_diffusion_is_the_dense_solution(masked):
     g, mask, weight = small_problem(masked, True, channels=1)
     method = AnisotropicDiffusion(contrast=0.7, n_iter=200, tol=1e-15, solve_tol=1e-11)
-    fields = method.check(g[None], *(None if f is None else f[None] for f in (mask, weight)))
-    tensors = method.data_term(fields)
+    fields = method._check_fields(g[None], *(None if f is None else f[None] for f in (mask, weight)))
+    tensors = method._data_term(fields)
     (xx, yy), xy = tensors.diagonal[0, 0].numpy(), tensors.mixed[0, 0, 0].numpy()
     assert np.abs(xy).max() > 0.2  # else the diagonal alone would do
     rows = residual_rows(g, mask, weight)
@@ -339,7 +339,7 @@ def test_diffusion_tensors():
     g = torch.zeros(1, 2, 9, 9, dtype=torch.float64)
     g[:, :, 4, 4] = 5 * torch.tensor([0.6, 0.8], dtype=torch.float64)
     method = AnisotropicDiffusion(beta=0.02)
-    tensors = method.data_term(method.check(g))
+    tensors = method._data_term(method._check_fields(g))
     (xx, yy), xy = tensors.diagonal[0, 0, :, 4, 4], tensors.mixed[0, 0, 0, 4, 4]
     T = torch.stack([torch.stack([xx, xy]), torch.stack([xy, yy])])
     across, along = (torch.tensor(e, dtype=torch.float64) for e in ((0.6, 0.8), (-0.8, 0.6)))

@@ -172,7 +172,7 @@ def test_outliers_are_found_and_replaced(name, share):
     wrong = torch.rand(1, 1, 96, 96, generator=seeded(5)) < share
     damaged = torch.where(wrong, gradient + 4 * random_field(1, 2, 96, 96, seed=6), gradient)
     clean = rmse(LeastSquares()(gradient), surface.height)
-    fields = LeastSquares().check(damaged)
+    fields = LeastSquares()._check_fields(damaged)
     repaired, flagged = replace_outliers(fields)
     assert (flagged & wrong).sum() > 0.85 * wrong.sum()
     assert (flagged & ~wrong).sum() < 0.02 * (~wrong).sum()
@@ -185,7 +185,7 @@ def test_outliers_are_found_and_replaced(name, share):
 @pytest.mark.parametrize("name", ["pyramid", "cone", "tent"])
 def test_creases_are_not_outliers(name):
     _, gradient = noisy(name, 96, 30)
-    _, flagged = replace_outliers(LeastSquares().check(gradient))
+    _, flagged = replace_outliers(LeastSquares()._check_fields(gradient))
     assert flagged.double().mean() < 0.02
 
 
@@ -193,13 +193,13 @@ def test_creases_are_not_outliers(name):
 def test_steep_steps_are_not_outliers(snr):
     """Narrow cliffs bend more within a pixel than any noise; taken for wrong, they would bring the stairs down."""
     surface, gradient = noisy("steps", 96, snr)
-    repaired, flagged = replace_outliers(LeastSquares().check(gradient))
+    repaired, flagged = replace_outliers(LeastSquares()._check_fields(gradient))
     assert flagged.double().mean() < 0.01
     plain, kept = (rmse(LeastSquares()(g), surface.height) for g in (gradient, repaired))
     assert kept < 1.3 * plain
     wrong = torch.rand(1, 1, 96, 96, generator=seeded(5)) < 0.03
     damaged = torch.where(wrong, gradient + 4 * random_field(1, 2, 96, 96, seed=6), gradient)
-    repaired, flagged = replace_outliers(LeastSquares().check(damaged))
+    repaired, flagged = replace_outliers(LeastSquares()._check_fields(damaged))
     assert (flagged & wrong).sum() > 0.9 * wrong.sum()
     assert rmse(LeastSquares()(repaired), surface.height) < 0.3 * rmse(LeastSquares()(damaged), surface.height)
 

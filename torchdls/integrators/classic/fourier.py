@@ -54,7 +54,7 @@ class FrankotChellappa(Integrator):
             )
         self.extension = extension
 
-    def integrate(self, fields: Fields) -> Tensor:
+    def _integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
         gx, gy = fields.gradient.split(1, -3)
         h, w = gx.shape[-2:]

@@ -44,17 +44,17 @@ class GlobalLeastSquares(Integrator):
         self.degree = degree
         self._degree = support - 1 if degree is None else degree
 
-    def modes_of(self, n: int, step: float, dim: int, like: Tensor) -> Modes:
+    def _modes_of(self, n: int, step: float, dim: int, like: Tensor) -> Modes:
         """The eigenvectors of the rows (dim -2) or columns (dim -1), n of them; what a subclass may choose."""
         return axis_modes(n, step, dim, self.support, self._degree, "cosine", n, 0.0, 1, like=like)
 
-    def integrate(self, fields: Fields) -> Tensor:
+    def _integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
         gx, gy = fields.gradient.split(1, -3)
         h, w = gx.shape[-2:]
         dx, dy = fields.steps
-        rows = self.modes_of(h, dy, -2, gx)
-        columns = self.modes_of(w, dx, -1, gx)
+        rows = self._modes_of(h, dy, -2, gx)
+        columns = self._modes_of(w, dx, -1, gx)
         right = columns.project(rows.project_slopes(gy)) + rows.project(columns.project_slopes(gx))
         return expand(right, rows, columns)
 
@@ -147,7 +147,7 @@ class SpectralRegularization(GlobalLeastSquares):
         self.modes = pair
         self.basis = basis
 
-    def modes_of(self, n: int, step: float, dim: int, like: Tensor) -> Modes:
+    def _modes_of(self, n: int, step: float, dim: int, like: Tensor) -> Modes:
         """The eigenvectors of an axis of n pixels within the span of its first modes."""
         asked = self.modes[2 + dim]
         count = asked if isinstance(asked, int) else max(1, round(asked * n))
@@ -213,22 +213,22 @@ class TikhonovRegularization(GlobalLeastSquares):
             self.lam = lam
         self.order = order
 
-    def modes_of(self, n: int, step: float, dim: int, like: Tensor) -> Modes:
+    def _modes_of(self, n: int, step: float, dim: int, like: Tensor) -> Modes:
         """The eigenvectors of D^T D + lam S^T S."""
         lam = _number(self.lam)
         return axis_modes(n, step, dim, self.support, self._degree, "cosine", n, lam, self.order, like=like)
 
-    def integrate(self, fields: Fields) -> Tensor:
+    def _integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels.
 
         The modes belong to one value of lam. Where its derivative is asked for, the change d of lam enters by the
         series z - d H^-1 R z + d^2 (H^-1 R)^2 z, with H the system at d = 0 and R z the derivative of the penalty.
         """
-        z = super().integrate(fields)
+        z = super()._integrate(fields)
         if not isinstance(self.lam, Tensor) or not is_recorded(self.lam):
             return z
         (h, w), (dx, dy) = z.shape[-2:], fields.steps
-        rows, columns = self.modes_of(h, dy, -2, z), self.modes_of(w, dx, -1, z)
+        rows, columns = self._modes_of(h, dy, -2, z), self._modes_of(w, dx, -1, z)
 
         def change(x: Tensor) -> Tensor:
             slope_x, slope_y = self._powers(x, fields.steps)
@@ -266,10 +266,10 @@ class TikhonovRegularization(GlobalLeastSquares):
         """
         if prior is None:
             return super().forward(gradient, mask, weight, anchor, anchor_weight)
-        fields = self.check(gradient, mask, weight, anchor, anchor_weight)
-        z0 = self._prior(prior, gradient) / self.unit
+        fields = self._check_fields(gradient, mask, weight, anchor, anchor_weight)
+        z0 = self._prior(prior, gradient) / self._unit
         rest = fields._replace(gradient=fields.gradient - self._slopes(z0, fields.steps))
-        height = (z0 + self.integrate(rest)) * self.unit
+        height = (z0 + self._integrate(rest)) * self._unit
         return height if gradient.ndim == 4 else height[0]
 
     if TYPE_CHECKING:

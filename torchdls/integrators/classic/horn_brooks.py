@@ -61,11 +61,11 @@ class HornBrooks(Integrator):
             raise ValueError(f"HornBrooks: relaxation={relaxation!r} given, a number between 0 and 2 is needed")
         self.tol, self.max_iter, self.relaxation = tol, max_iter, relaxation
 
-    def integrate(self, fields: Fields) -> Tensor:
+    def _integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
-        return self.told(fields).height
+        return self._report(fields).height
 
-    def told(self, fields: Fields) -> IntegrationResult:
+    def _report(self, fields: Fields) -> IntegrationResult:
         """The relaxation, and how many sweeps each surface took."""
         a = GradientOperator("forward", fields.steps)
         g = fields.gradient

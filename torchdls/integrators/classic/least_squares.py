@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic.dirichlet import solve_dirichlet
+from torchdls.integrators.data_term import Quadratic
 from torchdls.solvers import SolveResult, direct_result, integrate_direct, solve
 
 
@@ -44,7 +45,7 @@ class LeastSquares(Integrator):
         tensor([[[[-0.5000,  0.5000,  0.0000,  0.0000]]]])
     """
 
-    quadratic = True
+    _steady: bool | None = True
 
     def __init__(
         self,
@@ -62,24 +63,28 @@ class LeastSquares(Integrator):
         self.tol = tol
         self.max_iter = max_iter
         self.boundary = boundary
-        self.quadratic = boundary == "neumann"  # the quadratic does not hold a border
+        self._steady = True if boundary == "neumann" else None  # the quadratic does not hold a border
 
-    def integrate(self, fields: Fields) -> Tensor:
+    def _integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
-        return self.solve_fields(fields).height
+        return self._solve_fields(fields).height
 
-    def told(self, fields: Fields) -> IntegrationResult:
+    def _report(self, fields: Fields) -> IntegrationResult:
         """The height, and how the solve went."""
-        found = self.solve_fields(fields)
+        found = self._solve_fields(fields)
         return IntegrationResult(found.height, found.iterations, found.converged)
 
-    def solve_fields(self, fields: Fields, z0: Tensor | None = None) -> SolveResult:
+    def _data_term(self, fields: Fields) -> Quadratic:
+        """The slopes and trusts of the edges."""
+        return Quadratic.of(fields)
+
+    def _solve_fields(self, fields: Fields, z0: Tensor | None = None) -> SolveResult:
         """The solve and how it went, from a warm start z0."""
         if self.boundary == "dirichlet":
             return solve_dirichlet(fields, tol=self.tol, max_iter=self.max_iter, z0=z0)
         if fields.mask is None and fields.weight is None and fields.anchor is None:
             return direct_result(integrate_direct(fields.gradient, fields.steps))
-        v, w = self.edges(fields)
+        v, w, _ = self._data_term(fields)
         return solve(
             v,
             w,

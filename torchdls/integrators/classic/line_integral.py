@@ -41,7 +41,7 @@ class LineIntegral(Integrator):
 
     accepts = frozenset()
 
-    def integrate(self, fields: Fields) -> Tensor:
+    def _integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
         vx, vy = edge_slopes(fields.gradient)[0].split(1, -3)
         dx, dy = fields.steps

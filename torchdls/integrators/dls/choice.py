@@ -11,7 +11,7 @@ from torchdls._tracing import is_concrete
 from torchdls.integrators.base import Integrator
 from torchdls.integrators.classic.least_squares import LeastSquares
 from torchdls.integrators.dls.problem import Problem
-from torchdls.integrators.fields import even
+from torchdls.integrators.fields import has_even_trust
 from torchdls.selection import select
 
 # Over 15 surfaces from 1 to 40 dB this norm and cut gained the most in RMSE and in SSIM, and did the least harm.
@@ -41,7 +41,7 @@ def choose_threshold(model: Problem, automatic: bool, run: Callable[[Tensor, Ten
         ValueError: a surface has a mask with holes, unequal weights or an anchor.
     """
     fields = model.fields
-    if is_concrete(fields.gradient) and not bool(even(fields).all()):
+    if is_concrete(fields.gradient) and not bool(has_even_trust(fields).all()):
         what = "select=True predicts the risk on full rectangles with equal weights and no anchor"
         raise ValueError(f"DLS: {what}; gradient {tuple(fields.gradient.shape)} has others")
     factors = _FACTORS if automatic else (1.0,)

@@ -64,8 +64,7 @@ def implicit_derivative(
     Where K leaves the constant of the height free, the loss must not depend on it: see `remove_free_constants`.
     """
     fields, patches, valid = model.fields, model.patches, model.valid
-    assert model.edges is not None
-    v, w = model.edges
+    v, w = model.data.majoriser(z)
     w = present_edges(v) if w is None else w.expand_as(v)
     r = torch.zeros_like(z) if fields.anchor_weight is None else fields.anchor_weight.expand_as(z)
     lam = model.lam[:, None, None]

@@ -176,7 +176,7 @@ class DLS(Iterative[DLSResult]):
         self.data_term = LeastSquares() if data_term is None else data_term
         if not isinstance(self.data_term, Integrator):
             raise TypeError(f"DLS: data_term is a {type(data_term).__name__}, an Integrator is needed")
-        if not self.data_term.quadratic:
+        if self.data_term._steady is None:
             raise ValueError(f"DLS: data_term {type(data_term).__name__} is not built on the weighted solve")
         register_setting(self, "lam", check_strength("lam", lam))
         register_setting(self, "mu", check_strength("mu", mu))
@@ -190,13 +190,14 @@ class DLS(Iterative[DLSResult]):
         check_dictionary(initial, self.patches)
         register_setting(self, "dictionary", initial)
         self.derivative = derivative
-        self._derivative = choose_derivative(derivative, self.learn, self._settings.threshold, self._steady, initial)
+        rule, steady = self._settings.threshold, bool(self.data_term._steady)
+        self._derivative = choose_derivative(derivative, self.learn, rule, steady, initial)
 
-    def in_units(self, result: DLSResult) -> DLSResult:
+    def _in_units(self, result: DLSResult) -> DLSResult:
         """Height and codes in the unit of `pixel_size`."""
-        return result._replace(height=result.height * self.unit, codes=result.codes * self.unit)
+        return result._replace(height=result.height * self._unit, codes=result.codes * self._unit)
 
-    def iterate(self, fields: Fields, callback: Callback | None = None) -> DLSResult:
+    def _iterate(self, fields: Fields, callback: Callback | None = None) -> DLSResult:
         """The iterations, within the window of the patches that a mask leaves alive."""
         check_size(fields.gradient, self.patches)
         noise = self._noise(fields)
@@ -267,14 +268,14 @@ class DLS(Iterative[DLSResult]):
         lam = per_surface("lam", self.lam, _AUTO_LAM * torch.ones_like(noise))
         mu = per_surface("mu", self.mu, _AUTO_MU * noise)
         coverage = self.patches.coverage(shape, dtype=gradient.dtype, device=gradient.device)
-        edges = self.data_term.edges(fields) if self._steady else None
+        data = self.data_term._data_term(fields)
         schedule = self.mu if isinstance(self.mu, tuple) else None
         if mask is None:
             if self.patches.tile(shape):  # one number, with which the height is one direct solve
                 coverage = coverage[..., :1, :1]
-            return Problem(fields, self.patches, coverage, None, edges, noise, lam, mu, schedule)
+            return Problem(fields, self.patches, coverage, None, data, noise, lam, mu, schedule)
         valid = (self.patches.extract(mask.to(gradient.dtype)) > 0).expand(N, -1, -1)
-        return Problem(fields, self.patches, coverage * mask, valid, edges, noise, lam, mu, schedule)
+        return Problem(fields, self.patches, coverage * mask, valid, data, noise, lam, mu, schedule)
 
     def _noise(self, fields: Fields) -> Tensor:
         """(N,) noise of a gradient sample of mean weight; NaN where it cannot be told and mu does not need it."""
@@ -290,12 +291,6 @@ class DLS(Iterative[DLSResult]):
             if self.select:
                 raise ValueError(f"DLS: select=True finds no noise level ({error})") from error
             return fields.gradient.new_full((len(fields.gradient),), math.nan)
-
-    @property
-    def _steady(self) -> bool:
-        """Whether the data term is one quadratic, whatever the height."""
-        kind = type(self.data_term)
-        return kind.edges is Integrator.edges and kind.data_cost is Integrator.data_cost
 
     def _initial_dictionary(self, fields: Fields) -> Tensor:
         D = self.dictionary.to(fields.gradient)

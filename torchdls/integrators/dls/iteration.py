@@ -19,7 +19,7 @@ from torch import Tensor
 from torchdls.dictionary.learners import Learner
 from torchdls.dictionary.thresholds import Threshold
 from torchdls.integrators.base import Integrator
-from torchdls.integrators.data_term import edge_cost
+from torchdls.integrators.data_term import anchored_cost
 from torchdls.integrators.dls.options import Exact, Proximal
 from torchdls.integrators.dls.problem import Problem, State, drop_costly_codes, patch_cost
 from torchdls.integrators.dls.settings import Learn
@@ -50,7 +50,7 @@ class Settings(NamedTuple):
 
 def start(problem: Problem, D: Tensor, settings: Settings) -> State:
     """The height of the data term alone, and no codes: the patches are the residual."""
-    z = settings.data_term.integrate(problem.fields)
+    z = settings.data_term._integrate(problem.fields)
     if problem.valid is None:
         R = problem.patches.extract(z)
     else:
@@ -103,7 +103,7 @@ def update_height(problem: Problem, z: Tensor, folded: Tensor, settings: Setting
     with weight = 2 lam c (c patches hold a pixel), pull = 2 lam fold(D B), and anchors added to both.
     """
     fields = problem.fields
-    v, w = problem.edges or settings.data_term.edges(fields, z)
+    v, w = problem.data.majoriser(z)
     strength = 2 * problem.lam[:, None, None, None]
     weight = strength * problem.coverage
     pull = weight * z - strength * folded  # = 2 lam fold(D B), as fold(P) = coverage z
@@ -145,14 +145,9 @@ def proximal_map(moved: Tensor, tau: Tensor, weight: Tensor, pull: Tensor) -> Te
 
 def objective(problem: Problem, state: State, settings: Settings, iteration: int = -1) -> Tensor:
     """(N,) value of the cost with the threshold of an iteration, for heights in pixels."""
-    fields, z, mu = problem.fields, state.z, problem.at(iteration).mu
-    if problem.edges is None:
-        cost = settings.data_term.data_cost(fields, z)
-    else:
-        cost = edge_cost(z, *problem.edges, fields.steps)
-    if fields.anchor is not None and fields.anchor_weight is not None:
-        cost = cost + 0.5 * (fields.anchor_weight * (z - fields.anchor).square()).sum((-3, -2, -1))
-    return cost + problem.lam * patch_cost(state.R, state.B, mu, problem.valid, settings.threshold)
+    z, mu = state.z, problem.at(iteration).mu
+    patches = patch_cost(state.R, state.B, mu, problem.valid, settings.threshold)
+    return anchored_cost(problem.data, problem.fields, z) + problem.lam * patches
 
 
 def settled(problem: Problem, new: State, old: Tensor, settings: Settings, iteration: int) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchdls.integrators.classic.least_squares import LeastSquares
+from torchdls.integrators.data_term import Quadratic
 from torchdls.integrators.dls.problem import patch_cost
 from torchdls.operators import Patches
 
@@ -50,9 +51,8 @@ def dls_objective(
         tensor([128.])
     """
     patches = Patches() if patches is None else patches
-    data = LeastSquares()
-    fields = data.check(gradient, mask, weight)
+    fields = LeastSquares()._check_fields(gradient, mask, weight)
     valid = None if fields.mask is None else patches.extract(fields.mask.to(height.dtype)) > 0
     mu = torch.as_tensor(mu, dtype=height.dtype, device=height.device).expand(height.shape[0])
     R = patches.extract(height) - dictionary @ codes
-    return data.data_cost(fields, height) + lam * patch_cost(R, codes, mu, valid)
+    return Quadratic.of(fields).cost(height) + lam * patch_cost(R, codes, mu, valid)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchdls.dictionary.thresholds import Threshold, penalty, total_penalty
 from torchdls.integrators.base import Fields
+from torchdls.integrators.data_term import DataTerm
 from torchdls.operators import Patches
 
 # Numbers that are squared at once for their sum: a norm would need no memory, but in float32 it is off by 1e-4.
@@ -18,16 +19,16 @@ _AT_ONCE = 2**20
 class Problem(NamedTuple):
     """The constants of one run.
 
-    coverage (1 or N, 1, H, W) is counted within the mask; valid (N, n, L) marks the valid pixels of the patches; edges
-    are (v, w) where the data term keeps them, whatever the height; lam and mu are (N,). A schedule holds a threshold
-    for each iteration, and mu the last of them.
+    coverage (1 or N, 1, H, W) is counted within the mask; valid (N, n, L) marks the valid pixels of the patches; data
+    is the data term of the fields; lam and mu are (N,). A schedule holds a threshold for each iteration, mu the last
+    of them.
     """
 
     fields: Fields
     patches: Patches
     coverage: Tensor
     valid: Tensor | None
-    edges: tuple[Tensor, Tensor | None] | None
+    data: DataTerm
     noise: Tensor
     lam: Tensor
     mu: Tensor

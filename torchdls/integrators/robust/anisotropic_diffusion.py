@@ -11,7 +11,7 @@ from torch.nn.functional import conv2d
 
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
-from torchdls.integrators.robust.base import Robust, State
+from torchdls.integrators.robust.base import Estimate, Robust
 from torchdls.integrators.robust.convex import positive_or_auto
 from torchdls.integrators.robust.residuals import Terms
 from torchdls.operators import GradientOperator
@@ -40,6 +40,11 @@ class Tensors(NamedTuple):
     def energy(self, r: Tensor) -> Tensor:
         """(N,) the data term for residuals r."""
         return self.terms.total(self.terms.trust * r * self.applied(r)) / 2
+
+    @property
+    def steady(self) -> bool:
+        """Its quadratic follows the height."""
+        return False
 
     def cost(self, z: Tensor) -> Tensor:
         """(N,) its value at z."""
@@ -112,7 +117,7 @@ class AnisotropicDiffusion(Robust):
         self.beta = beta
         self.contrast = positive_or_auto("AnisotropicDiffusion", "contrast", contrast)
 
-    def data_term(self, fields: Fields) -> Tensors:
+    def _data_term(self, fields: Fields) -> Tensors:
         """The tensors of the field, bound to its residuals."""
         g = fields.gradient
         trusted = torch.ones_like(g, dtype=torch.bool) if fields.weight is None else (fields.weight > 0).expand_as(g)
@@ -135,11 +140,11 @@ class AnisotropicDiffusion(Robust):
         diagonal = torch.cat([1 - loss * (1 + tilt) / 2, 1 - loss * (1 - tilt) / 2], 1)
         return Tensors(Terms.of(fields, joint=True), diagonal[:, None], (-loss * xy / q)[:, None])
 
-    def _begin(self, fields: Fields, data: DataTerm) -> State:
+    def _begin(self, fields: Fields, data: DataTerm) -> Estimate:
         (z,) = super()._begin(fields, data)
         return z, torch.zeros_like(z), torch.ones_like(z[:, :, :1, :1])
 
-    def _advance(self, fields: Fields, data: DataTerm, state: State) -> State:
+    def _advance(self, fields: Fields, data: DataTerm, state: Estimate) -> Estimate:
         z, direction, before = state
         tensors = cast(Tensors, data)
         v, w = tensors.majoriser(z)

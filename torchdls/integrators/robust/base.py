@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from torchdls.integrators.base import Fields
-from torchdls.integrators.data_term import DataTerm
+from torchdls.integrators.data_term import DataTerm, anchored_cost
 from torchdls.integrators.iterative import Callback, Iterative
+from torchdls.integrators.settling import run_until_settled
 from torchdls.operators import edge_slopes
 from torchdls.solvers import solve
 
-State = tuple[Tensor, ...]  # the height first, then whatever else an iteration hands to the next; all (N, ...)
+Estimate = tuple[Tensor, ...]  # the height first, then whatever else an iteration hands to the next; all (N, ...)
 
 
 class RobustResult(NamedTuple):
@@ -41,10 +42,18 @@ class RobustResult(NamedTuple):
     converged: Tensor
 
 
+class _Problem(NamedTuple):
+    """What an iteration needs besides the estimate; the rounding of the objective is (N,)."""
+
+    fields: Fields
+    data: DataTerm
+    rounding: Tensor
+
+
 class Robust(Iterative[RobustResult]):
     """An integrator that repeats the solve (*) until its own objective settles, surface by surface.
 
-    A subclass provides its `data_term`. Its majoriser makes it a data term of DLS; solving for the minimum of the
+    A subclass provides its `_data_term`. Its majoriser makes it a data term of DLS; solving for the minimum of the
     majoriser again and again is also the default iteration (`_advance`), in which the objective never rises.
 
     The derivative is that of the iterations run (unrolled, each solve by its implicit rule), in every input that is a
@@ -57,7 +66,7 @@ class Robust(Iterative[RobustResult]):
         pixel_size: (dx, dy) or one number; heights come out in its unit.
     """
 
-    quadratic = True
+    _steady = False
 
     def __init__(
         self, *, n_iter: int, tol: float, solve_tol: float = 1e-6, pixel_size: float | Sequence[float] = 1.0
@@ -71,56 +80,45 @@ class Robust(Iterative[RobustResult]):
         self.n_iter, self.tol, self.solve_tol = n_iter, tol, solve_tol
 
     @abstractmethod
-    def data_term(self, fields: Fields) -> DataTerm:
+    def _data_term(self, fields: Fields) -> DataTerm:
         """The data term of checked fields."""
 
-    def edges(self, fields: Fields, z: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
-        """Slopes v and trusts w of the quadratic that majorises the data term around z (least squares for None)."""
-        if z is None:
-            return edge_slopes(fields.gradient, fields.mask, fields.weight)
-        return self.data_term(fields).majoriser(z)
-
-    def data_cost(self, fields: Fields, z: Tensor) -> Tensor:
-        """(N,) the data term at z, in pixels."""
-        return self.data_term(fields).cost(z)
-
-    def in_units(self, result: RobustResult) -> RobustResult:
+    def _in_units(self, result: RobustResult) -> RobustResult:
         """The height in the unit of `pixel_size`."""
-        return result._replace(height=result.height * self.unit)
+        return result._replace(height=result.height * self._unit)
 
-    def iterate(self, fields: Fields, callback: Callback | None = None) -> RobustResult:
+    def _iterate(self, fields: Fields, callback: Callback | None = None) -> RobustResult:
         """The iterations, each surface until its objective settles."""
-        data = self.data_term(fields)
-        state = self._begin(fields, data)
-        rounding = 10 * torch.finfo(state[0].dtype).eps * _objective(fields, data, torch.zeros_like(state[0])).detach()
-        objective = [_objective(fields, data, state[0])]
-        active = torch.ones_like(rounding, dtype=torch.bool)
-        iterations = torch.zeros_like(rounding, dtype=torch.int64)
-        for iteration in range(1, self.n_iter + 1):
-            ahead = self._advance(fields, data, state)
-            state = tuple(choose(active, new, old) for new, old in zip(ahead, state, strict=True))
-            objective.append(choose(active, _objective(fields, data, state[0]), objective[-1]))
-            iterations = iterations + active
-            if callback is not None:
-                callback(iteration, objective[-1].detach())
-            if self.tol > 0:
-                change = (objective[-1] - objective[-2]).abs() + self._gap(data, state)
-                active = active & (change > self.tol * objective[-1] + rounding)
-                if not bool(active.any()):
-                    break
-        return RobustResult(state[0], torch.stack(objective, 1), iterations, ~active)
+        data = self._data_term(fields)
+        begin = self._begin(fields, data)
+        flat = anchored_cost(data, fields, torch.zeros_like(begin[0])).detach()
+        start = anchored_cost(data, fields, begin[0])
 
-    def _begin(self, fields: Fields, data: DataTerm) -> State:
+        def advance(problem: _Problem, old: Estimate, before: Tensor, _: int) -> tuple[Estimate, Tensor, Tensor]:
+            fields, data, rounding = problem
+            new = self._advance(fields, data, old)
+            cost = anchored_cost(data, fields, new[0])
+            change = (cost - before).abs() + self._gap(data, new)
+            return new, cost[:, None], ~(change > self.tol * cost + rounding)
+
+        problem = _Problem(fields, data, 10 * torch.finfo(flat.dtype).eps * flat)
+        return RobustResult(
+            *run_until_settled(
+                problem, begin, start, advance, self.n_iter, tol=self.tol, finish=_height, callback=callback
+            )
+        )
+
+    def _begin(self, fields: Fields, data: DataTerm) -> Estimate:
         """Where to start: the least-squares surface."""
         v, w = edge_slopes(fields.gradient, fields.mask, fields.weight)
         return (self._surface(fields, v, w, fields.anchor_weight),)
 
-    def _advance(self, fields: Fields, data: DataTerm, state: State) -> State:
+    def _advance(self, fields: Fields, data: DataTerm, state: Estimate) -> Estimate:
         """One iteration: the minimum of the quadratic that majorises the objective around the height."""
         v, w = data.majoriser(state[0])
         return (self._surface(fields, v, w, fields.anchor_weight, state[0]),)
 
-    def _gap(self, data: DataTerm, state: State) -> Tensor | float:
+    def _gap(self, data: DataTerm, state: Estimate) -> Tensor | float:
         """(N,) how far the cost at the height may be from what the iteration itself believes."""
         return 0.0
 
@@ -132,14 +130,6 @@ class Robust(Iterative[RobustResult]):
         return solve(v, w, fields.anchor, anchor_weight, tol=self.solve_tol, z0=guess, pixel_size=fields.steps).height
 
 
-def choose(active: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """The new value where a surface is still active."""
-    return torch.where(active.view(-1, *[1] * (new.ndim - 1)), new, old)
-
-
-def _objective(fields: Fields, data: DataTerm, z: Tensor) -> Tensor:
-    """(N,) data term and anchors."""
-    cost = data.cost(z)
-    if fields.anchor is not None and fields.anchor_weight is not None:
-        cost = cost + 0.5 * (fields.anchor_weight * (z - fields.anchor).square()).sum((-3, -2, -1))
-    return cost
+def _height(_: _Problem, estimate: Estimate) -> Tensor:
+    """What is kept of an estimate that iterates no more."""
+    return estimate[0]

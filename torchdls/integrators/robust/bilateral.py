@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
-from torchdls.integrators.robust.base import Robust, State
+from torchdls.integrators.robust.base import Estimate, Robust
 from torchdls.integrators.robust.residuals import Terms
 
 
@@ -31,6 +31,11 @@ class BilateralTerm(NamedTuple):
         """(N, 2, 2, H, W): n^2 times how much more the surface of z bends away on the other side of the pixel."""
         steps = self.facing * self.terms.difference(z).square()
         return self.facing * torch.sigmoid(self.sharpness * (steps.flip(1) - steps))
+
+    @property
+    def steady(self) -> bool:
+        """Its quadratic follows the height."""
+        return False
 
     def cost(self, z: Tensor) -> Tensor:
         """(N,) its value at z, with the trusts of z."""
@@ -93,13 +98,13 @@ class Bilateral(Robust):
             raise ValueError(f"Bilateral: k={k!r} and focal_length={focal_length!r} given, both must be positive")
         self.k, self.focal_length = k, focal_length
 
-    def data_term(self, fields: Fields) -> BilateralTerm:
+    def _data_term(self, fields: Fields) -> BilateralTerm:
         """The one-sided residuals, and how each pixel faces the viewer."""
         terms = Terms.of(fields, joint=False)
         slope = (self.focal_length * fields.gradient).square().sum(1, keepdim=True)[:, None]
         return BilateralTerm(terms, 1 / (1 + slope), self.k * self.focal_length**2)
 
-    def _begin(self, fields: Fields, data: DataTerm) -> State:
+    def _begin(self, fields: Fields, data: DataTerm) -> Estimate:
         """The surface of equal trust in both sides."""
         assert isinstance(data, BilateralTerm)
         v, w = data.terms.quadratic(data.facing.expand_as(data.terms.live))

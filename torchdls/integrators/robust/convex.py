@@ -11,7 +11,7 @@ from torch import Tensor
 from torchdls._tracing import holds_everywhere
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
-from torchdls.integrators.robust.base import Robust, State
+from torchdls.integrators.robust.base import Estimate, Robust
 from torchdls.integrators.robust.residuals import Terms, sample_noise
 
 _RELAX = 1.8  # over-relaxation of ADMM
@@ -32,6 +32,11 @@ class Penalty(NamedTuple):
     terms: Terms
     strength: Tensor
     corner: Tensor
+
+    @property
+    def steady(self) -> bool:
+        """Its quadratic follows the height."""
+        return False
 
     def cost(self, z: Tensor) -> Tensor:
         """(N,) its value at z."""
@@ -73,7 +78,7 @@ class Convex(Robust):
     r(z), by less than `tol` in all.
     """
 
-    def _begin(self, fields: Fields, data: DataTerm) -> State:
+    def _begin(self, fields: Fields, data: DataTerm) -> Estimate:
         (z,) = super()._begin(fields, data)
         terms = cast(Penalty, data).terms
         r = terms.residual(z)
@@ -81,7 +86,7 @@ class Convex(Robust):
         step = terms.size(r).flatten(1).sum(1) / number.flatten(1).sum(1).clamp(min=1)
         return z, r, torch.zeros_like(r), torch.where(step > 0, step, 1)[:, None, None, None]
 
-    def _advance(self, fields: Fields, data: DataTerm, state: State) -> State:
+    def _advance(self, fields: Fields, data: DataTerm, state: Estimate) -> Estimate:
         z, d, u, step = state
         penalty = cast(Penalty, data)
         terms, r = penalty.terms, fields.anchor_weight
@@ -93,7 +98,7 @@ class Convex(Robust):
         d = penalty.shrink(x, step[..., None])
         return z, d, x - d, step
 
-    def _gap(self, data: DataTerm, state: State) -> Tensor | float:
+    def _gap(self, data: DataTerm, state: Estimate) -> Tensor | float:
         penalty = cast(Penalty, data)
         return (penalty.cost(state[0]) - penalty.cost_of(state[1])).abs()
 
@@ -101,7 +106,7 @@ class Convex(Robust):
 class _Linear(Convex):
     """What TotalVariation and L1 share: a corner at `smoothing` times the noise."""
 
-    joint: bool
+    _joint: bool
 
     def __init__(
         self,
@@ -117,10 +122,10 @@ class _Linear(Convex):
             raise ValueError(f"{type(self).__name__}: smoothing={smoothing!r} given, at least 0 is needed")
         self.smoothing = smoothing
 
-    def data_term(self, fields: Fields) -> Penalty:
+    def _data_term(self, fields: Fields) -> Penalty:
         """The penalty of the residuals, rounded at `smoothing` times the noise."""
         noise = sample_noise(fields)[..., None]
-        return Penalty(Terms.of(fields, joint=self.joint), noise, self.smoothing * noise)
+        return Penalty(Terms.of(fields, joint=self._joint), noise, self.smoothing * noise)
 
 
 class TotalVariation(_Linear):
@@ -161,7 +166,7 @@ class TotalVariation(_Linear):
         [0.24, 0.03]
     """
 
-    joint = True
+    _joint = True
 
 
 class L1(_Linear):
@@ -196,7 +201,7 @@ class L1(_Linear):
         [0.24, 0.03]
     """
 
-    joint = False
+    _joint = False
 
 
 class Huber(Convex):
@@ -241,7 +246,7 @@ class Huber(Convex):
         super().__init__(n_iter=n_iter, tol=tol, solve_tol=solve_tol, pixel_size=pixel_size)
         self.delta = positive_or_auto("Huber", "delta", delta)
 
-    def data_term(self, fields: Fields) -> Penalty:
+    def _data_term(self, fields: Fields) -> Penalty:
         """Huber's penalty of the residuals."""
         corner = level(self.delta, _HUBER, fields)
         return Penalty(Terms.of(fields, joint=False), corner, corner)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
-from torchdls.integrators.robust.base import Robust, State
+from torchdls.integrators.robust.base import Estimate, Robust
 from torchdls.integrators.robust.convex import Huber, level, positive_or_auto
 from torchdls.integrators.robust.residuals import Terms
 
@@ -43,6 +43,11 @@ class LossTerm(NamedTuple):
     loss: Loss
     scale: Tensor
     floor: float
+
+    @property
+    def steady(self) -> bool:
+        """Its quadratic follows the height."""
+        return False
 
     def cost(self, z: Tensor) -> Tensor:
         """(N,) its value at z."""
@@ -115,17 +120,17 @@ class MEstimator(Robust):
         self.loss, self.floor = loss, floor
         self.scale = positive_or_auto("MEstimator", "scale", scale)
 
-    def data_term(self, fields: Fields) -> LossTerm:
+    def _data_term(self, fields: Fields) -> LossTerm:
         """The loss of the residuals."""
         loss = LOSSES[self.loss]
         return LossTerm(Terms.of(fields, joint=False), loss, level(self.scale, loss.tuning, fields), self.floor)
 
-    def _begin(self, fields: Fields, data: DataTerm) -> State:
+    def _begin(self, fields: Fields, data: DataTerm) -> Estimate:
         return (huber_start(self, fields),)
 
 
 def huber_start(method: Robust, fields: Fields) -> Tensor:
     """The convex surface of `Huber`, nearly, from which the objectives that are not convex start."""
-    return Huber(n_iter=2 * method.n_iter, tol=min(100 * method.tol, 1e-4), solve_tol=method.solve_tol).integrate(
+    return Huber(n_iter=2 * method.n_iter, tol=min(100 * method.tol, 1e-4), solve_tol=method.solve_tol)._integrate(
         fields
     )

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
-from torchdls.integrators.robust.base import Robust, State
+from torchdls.integrators.robust.base import Estimate, Robust
 from torchdls.integrators.robust.convex import level, positive_or_auto
 from torchdls.integrators.robust.m_estimator import huber_start
 from torchdls.integrators.robust.residuals import Terms
@@ -45,6 +45,11 @@ class Smoothness(NamedTuple):
         weight = (stiff + c) / (stiff * self.width**2)
         flat = torch.zeros_like(c).expand(-1, 2, -1, -1)
         return solve(flat, self.links, anchor, weight, tol=self.tol, pixel_size=self.steps).height
+
+    @property
+    def steady(self) -> bool:
+        """Its quadratic follows the height."""
+        return False
 
     def cost(self, z: Tensor) -> Tensor:
         """(N,) its value at z."""
@@ -118,7 +123,7 @@ class MumfordShah(Robust):
         self.kappa = positive_or_auto("MumfordShah", "kappa", kappa)
         self.width, self.floor = width, floor
 
-    def data_term(self, fields: Fields) -> Smoothness:
+    def _data_term(self, fields: Fields) -> Smoothness:
         """The functional, minimised over s."""
         kappa = level(self.kappa, _AUTO, fields)[:, 0]
         links = edge_slopes(fields.gradient, fields.mask)[1]
@@ -127,7 +132,7 @@ class MumfordShah(Robust):
             terms, kappa, self.width, self.floor, links, fields.mask, fields.steps, min(self.solve_tol, 1e-6)
         )
 
-    def _begin(self, fields: Fields, data: DataTerm) -> State:
+    def _begin(self, fields: Fields, data: DataTerm) -> Estimate:
         return (huber_start(self, fields),)
 
     def indicator(
@@ -138,7 +143,7 @@ class MumfordShah(Robust):
         weight: Tensor | None = None,
     ) -> Tensor:
         """The field s of a height (N, 1, H, W): 1 on smooth parts, towards 0 along jumps; 0 outside the mask."""
-        data = self.data_term(self.check(gradient, mask, weight))
-        s = data.indicator(data.misfit((height if height.ndim == 4 else height[None]) / self.unit))
+        data = self._data_term(self._check_fields(gradient, mask, weight))
+        s = data.indicator(data.misfit((height if height.ndim == 4 else height[None]) / self._unit))
         s = s if data.inside is None else torch.where(data.inside, s, 0)
         return s if height.ndim == 4 else s[0]

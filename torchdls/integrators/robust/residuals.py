@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls._tracing import seen_everywhere
 from torchdls.integrators.base import Fields
-from torchdls.operators import GradientOperator, edge_slopes
+from torchdls.operators import GradientOperator, edge_slopes, present_edges
 
 _LEAST_NOISE = 1e-3  # of the root mean square slope: noise below it is treated as this much
 
@@ -56,7 +56,7 @@ class Terms(NamedTuple):
         g = fields.gradient
         there = edge_slopes(g, fields.mask)[1]
         trust = torch.ones_like(g[:, :1]) if fields.weight is None else fields.weight
-        live = (_spread(present(g) if there is None else there, joint) > 0) & (trust > 0)[:, None]
+        live = (_spread(present_edges(g) if there is None else there, joint) > 0) & (trust > 0)[:, None]
         plain = fields.mask is None and (fields.weight is None or seen_everywhere(trust > 0))
         if joint:
             trust = trust.mean(1, keepdim=True)
@@ -109,12 +109,6 @@ def _spread(edges: Tensor, joint: bool) -> Tensor:
     return torch.stack([torch.stack(pair, 1) for pair in pairs], 1)
 
 
-def present(v: Tensor) -> Tensor:
-    """1 on every edge of the rectangle, 0 beyond its last column and row; (N, 2, H, W) as v."""
-    ones = torch.ones_like(v[:, :1])
-    return torch.cat([pad(ones[..., :-1], (0, 1)), pad(ones[..., :-1, :], (0, 0, 0, 1))], 1)
-
-
 def sample_noise(fields: Fields) -> Tensor:
     r"""(N, 1, 1, 1) standard deviation of one slope around those of its neighbours, however many outliers (but half).
 
@@ -141,13 +135,3 @@ def least_slope(g: Tensor, live: Tensor) -> Tensor:
     """(N,) a thousandth of the root mean square slope, or 1 for a field of zeros."""
     square = torch.where(live, g, 0).square().flatten(1).sum(1) / live.flatten(1).sum(1).clamp(min=1)
     return torch.where(square > 0, _LEAST_NOISE * torch.where(square > 0, square, 1).sqrt(), 1)
-
-
-def curl_of(fields: Fields) -> tuple[Tensor, Tensor]:
-    """Sum of the slopes around each cell of 2 x 2 pixels (N, H - 1, W - 1), and the cells that have all four edges."""
-    v, w = edge_slopes(fields.gradient, fields.mask, fields.weight)
-    live = (present(v) if w is None else w) > 0
-    x, y = v[:, 0, :, :-1] * fields.steps[0], v[:, 1, :-1] * fields.steps[1]
-    curl = x[:, :-1] - x[:, 1:] + y[..., 1:] - y[..., :-1]
-    ex, ey = live[:, 0, :, :-1], live[:, 1, :-1]
-    return curl, ex[:, :-1] & ex[:, 1:] & ey[..., 1:] & ey[..., :-1]

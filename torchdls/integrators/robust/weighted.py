@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls.integrators.base import Fields
 from torchdls.integrators.classic.least_squares import LeastSquares
-from torchdls.integrators.robust.residuals import curl_of, least_slope, present
-from torchdls.operators import edge_slopes
+from torchdls.integrators.data_term import Quadratic
+from torchdls.integrators.robust.residuals import least_slope
+from torchdls.operators.edges import beside_edges, cell_curl, complete_cells, present_edges
 from torchdls.solvers import SolveResult, solve
 
 
@@ -65,32 +65,27 @@ class WeightedLeastSquares(LeastSquares):
             raise ValueError(f"WeightedLeastSquares: threshold={threshold!r} and floor={floor!r} must be positive")
         self.threshold, self.floor = threshold, floor
 
-    def solve_fields(self, fields: Fields, z0: Tensor | None = None) -> SolveResult:
+    def _solve_fields(self, fields: Fields, z0: Tensor | None = None) -> SolveResult:
         """The solve and how it went, from a warm start z0."""
-        v, w = self.edges(fields)
+        v, w, _ = self._data_term(fields)
         anchors = fields.anchor, fields.anchor_weight
         return solve(v, w, *anchors, tol=self.tol, max_iter=self.max_iter, z0=z0, pixel_size=fields.steps)
 
-    def edges(self, fields: Fields, z: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
-        """Slopes v and trusts q w; they do not depend on z."""
-        v, w = edge_slopes(fields.gradient, fields.mask, fields.weight)
-        w = present(v) if w is None else w
-        return v, w * self._trust(fields)
+    def _data_term(self, fields: Fields) -> Quadratic:
+        """Slopes v and trusts q w; they do not depend on the height."""
+        v, w, steps = super()._data_term(fields)
+        w = present_edges(v) if w is None else w
+        return Quadratic(v, w * self._trust(fields), steps)
 
     def _trust(self, fields: Fields) -> Tensor:
         """(N, 2, H, W), q."""
         g = fields.gradient
         valid = torch.ones_like(g, dtype=torch.bool) if fields.weight is None else (fields.weight > 0).expand_as(g)
         valid = valid if fields.mask is None else valid & fields.mask
-        curl, cells = curl_of(fields)
+        v, w, _ = super()._data_term(fields)
+        curl, cells = cell_curl(v, fields.steps), complete_cells((present_edges(v) if w is None else w) > 0)
         noise = masked_median(curl.abs().flatten(1), cells.flatten(1)) / NORMAL_MEDIAN
         kappa = self.threshold * torch.maximum(noise, least_slope(g, valid))
         badness = torch.where(cells, (curl / kappa[:, None, None]).square(), 0)
-        number = _beside(cells.to(curl.dtype)).clamp(min=1)
-        return (1 + _beside(badness) / number).square().reciprocal() + self.floor
-
-
-def _beside(cells: Tensor) -> Tensor:
-    """Sum of a cell field (N, H - 1, W - 1) over the two cells beside each edge: (N, 2, H, W)."""
-    low = pad(cells, (0, 1, 0, 1))
-    return torch.stack([low + pad(cells, (0, 1, 1, 0)), low + pad(cells, (1, 0, 0, 1))], 1)
+        number = beside_edges(cells.to(curl.dtype)).clamp(min=1)
+        return (1 + beside_edges(badness) / number).square().reciprocal() + self.floor

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from torchdls._tracing import is_concrete
 from torchdls.integrators.base import Fields
-from torchdls.integrators.data_term import edge_cost
-from torchdls.integrators.fields import even, largest
+from torchdls.integrators.data_term import Quadratic
+from torchdls.integrators.fields import has_even_trust, largest_per_surface
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.slope_dls.coding import Aggregate, Noise, SlopeScale, average
 from torchdls.integrators.slope_dls.outliers import replace_outliers
@@ -215,11 +215,11 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
             given["n_iter"] = self.n_iter
         return [replace(run, **given) for run in _RUNS[self.recipe]]
 
-    def in_units(self, result: SlopeDLSResult) -> SlopeDLSResult:
+    def _in_units(self, result: SlopeDLSResult) -> SlopeDLSResult:
         """The height in the unit of `pixel_size`; slopes and their codes have none."""
-        return result._replace(height=result.height * self.unit)
+        return result._replace(height=result.height * self._unit)
 
-    def iterate(self, fields: Fields, callback: Callback | None = None) -> SlopeDLSResult:
+    def _iterate(self, fields: Fields, callback: Callback | None = None) -> SlopeDLSResult:
         """Outliers replaced, the iterations, and the guard."""
         trusted = torch.ones_like(fields.gradient[:, :1]) if fields.mask is None else fields.mask.to(fields.gradient)
         if fields.mask is not None and is_concrete(fields.mask) and bool(fields.mask.all()):
@@ -253,12 +253,12 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
 
     def _exact(self, fields: Fields, noise: Noise, callback: Callback | None) -> SlopeDLSResult:
         """By the runs of the recipe, on full rectangles with equal trust."""
-        v, w = self.edges(fields)
+        data = Quadratic.of(fields)
         start = solve(edge_slopes(fields.gradient)[0], pixel_size=fields.steps).height
-        misfit = [edge_cost(start, v, w, fields.steps)]
+        misfit = [data.cost(start)]
 
         def watch(z: Tensor) -> None:
-            misfit.append(edge_cost(z, v, w, fields.steps))
+            misfit.append(data.cost(z))
             if callback is not None:
                 callback(len(misfit) - 1, misfit[-1].detach())
 
@@ -269,13 +269,14 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
     def _plain(self, fields: Fields, noise: Noise, callback: Callback | None = None) -> SlopeDLSResult:
         recipe = replace(_PLAIN[self.recipe], **self._given())
         a = GradientOperator("forward", fields.steps)
-        v, w = self.edges(fields)
+        data = Quadratic.of(fields)
+        v, w, _ = data
         z = start = self._height(fields, v, w, None)
         valid, coded = _continue(fields, z, w, self.z_tol)
         scales = _scales(fields, recipe.patch_sizes)
         D = scales[0].initial_dictionary(v) if recipe.learn else None
         B: Tensor | None = None
-        misfit = [edge_cost(z, v, w, fields.steps)]
+        misfit = [data.cost(z)]
         for iteration in range(recipe.n_iter):
             slopes = extend_edges(a(z))
             slopes = slopes if valid is None else torch.where(valid, slopes, coded)
@@ -290,7 +291,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
             z = self._height(fields, (v + _KAPPA * coded) / (1 + _KAPPA), w, z)
             if self.guard is not None:
                 z = torch.where(noise.even, discrepancy_guard(z, start, noise.overall, fields.steps), z)
-            misfit.append(edge_cost(z, v, w, fields.steps))
+            misfit.append(data.cost(z))
             if callback is not None:
                 callback(iteration + 1, misfit[-1].detach())
         return SlopeDLSResult(z, D, B, torch.stack(misfit, 1), noise.level, z)
@@ -316,8 +317,8 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
                 raise ValueError(f"SlopeDLS: sigma {tuple(level.shape)} does not fit {n} surfaces")
             level = level.reshape(-1).expand(n)
         trust = None if weight is None else edge_slopes(gradient, fields.mask, weight)[1]
-        overall = level if weight is None else level * largest(weight).flatten().clamp(min=1e-30).rsqrt()
-        return Noise(level, trust, overall, even(fields, weight))
+        overall = level if weight is None else level * largest_per_surface(weight).flatten().clamp(min=1e-30).rsqrt()
+        return Noise(level, trust, overall, has_even_trust(fields, weight))
 
     def _from_map(self, sigma: Tensor, fields: Fields) -> tuple[Tensor, Tensor]:
         """Weights and level of a noise map: its root mean square is the level."""
@@ -334,7 +335,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         """The height after a last blend with least squares, where the noise is uniform."""
         n, step = probe(fields.gradient, noise.overall)
         probed = fields._replace(gradient=fields.gradient + step * n)
-        start, moved = (self._height(f, *self.edges(f), None) for f in (fields, fields._replace(gradient=n)))
+        start, moved = (self._height(f, *Quadratic.of(f)[:2], None) for f in (fields, fields._replace(gradient=n)))
         change = (self._smooth(probed, noise).height - z) / step
         return torch.where(noise.even, sure_guard(z, start, change, moved, noise.overall), z)
 

@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torchdls._statistics import NORMAL_MEDIAN
+from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls.integrators.base import Fields
 from torchdls.operators import GradientOperator, edge_slopes
+from torchdls.operators.edges import edges_at_pixels, present_edges
 from torchdls.solvers import solve
 
 _LIMITS = (16.0, 12.0, 9.0, 7.0, 6.0, 5.0, 4.0, 4.0)  # robust standard deviations, loop by loop
@@ -49,7 +50,8 @@ def replace_outliers(fields: Fields, *, tol: float = 1e-5) -> tuple[Tensor, Tens
         z = solve(v, w, fields.anchor, fields.anchor_weight, tol=tol, z0=guess, pixel_size=fields.steps).height
         expected = _at_pixels(a(z), fields.mask)
         distance = (given - expected).detach().norm(dim=1, keepdim=True)
-        scale = _median(distance, inside) / NORMAL_MEDIAN / 1.7  # the norm of two components is larger than one
+        median = masked_median(distance.flatten(1), inside.flatten(1))[:, None, None, None]
+        scale = median / NORMAL_MEDIAN / 1.7  # the norm of two components is larger than one
         wrong = inside & (distance > limit * scale) & (nearest > torch.maximum(4 * scale, spread))
         present = torch.where(wrong, expected, given)
     return present, wrong
@@ -57,23 +59,9 @@ def replace_outliers(fields: Fields, *, tol: float = 1e-5) -> tuple[Tensor, Tens
 
 def _at_pixels(slopes: Tensor, mask: Tensor | None) -> Tensor:
     """Mean over the (one or two) edges at each pixel and direction, (N, 2, H, W)."""
-    present = edge_slopes(torch.zeros_like(slopes), mask, torch.ones_like(slopes[:, :1]))[1]
-    assert present is not None
-    present = (present > 0).to(slopes.dtype)
-    sums, counts = (_both_edges(x) for x in (slopes * present, present))
-    return sums / counts.clamp(min=1)
-
-
-def _both_edges(x: Tensor) -> Tensor:
-    """The edge after a pixel plus the edge before it."""
-    before_x = functional.pad(x[:, :1, :, :-1], (1, 0))
-    before_y = functional.pad(x[:, 1:, :-1], (0, 0, 1, 0))
-    return x + torch.cat([before_x, before_y], 1)
-
-
-def _median(x: Tensor, inside: Tensor) -> Tensor:
-    """(N, 1, 1, 1) median over the pixels inside."""
-    return torch.where(inside, x, torch.nan).flatten(1).nanmedian(1).values[:, None, None, None]
+    there = edge_slopes(torch.zeros_like(slopes), mask)[1]
+    there = (present_edges(slopes) if there is None else there > 0).to(slopes.dtype)
+    return edges_at_pixels(slopes * there) / edges_at_pixels(there).clamp(min=1)
 
 
 def _surroundings(g: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
