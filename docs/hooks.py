@@ -36,7 +36,7 @@ def reference() -> str:
     rooms: dict[str, list[str]] = {room: [] for room in ROOMS}
     for name in public_names():
         value = getattr(torchdls, name)
-        module = getattr(value, "__module__", None) or room_of(name)
+        module = value.__module__ if hasattr(value, "__name__") else room_of(name)
         rooms.setdefault(module.split(".")[1], []).append(name)
     parts = ["# Reference\n\nEvery public name; all of them import from `torchdls`.\n"]
     for room, names in rooms.items():
