@@ -50,6 +50,12 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def made_by(module: str) -> str:
+    """The line under a table or a picture: what made it, and the commit that this run started from."""
+    changed = ", with changes that were not committed" if AT_START["uncommitted_changes"] else ""
+    return f"Made by `python -m {module}` at {AT_START['commit']}{changed}.\n"
+
+
 def replace_section(path: Path | str, name: str, text: str) -> None:
     """Put text between the lines `<!-- name -->` and `<!-- /name -->` of a Markdown file."""
     path, start, end = Path(path), f"<!-- {name} -->", f"<!-- /{name} -->"

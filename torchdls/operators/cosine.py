@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_real, require
 from torchdls.operators.tables import table
 
 # Up to this side two products with the cosine matrix beat the FFT and its reordering passes (measured on a CPU).
@@ -27,6 +28,10 @@ def dct2(x: Tensor) -> Tensor:
     Returns:
         (..., H, W), in the dtype and on the device of `x`.
 
+    Raises:
+        TypeError: `x` is not a tensor of float32 or float64.
+        ValueError: `x` is empty or has fewer than two dimensions.
+
     Source: Makhoul, "A fast cosine transform in one and two dimensions", IEEE TASSP 28(1), 1980.
 
     Example:
@@ -36,6 +41,7 @@ def dct2(x: Tensor) -> Tensor:
         >>> round(float(coefficients.norm()), 3)
         4.0
     """
+    _check("dct2", x)
     h, w = x.shape[-2:]
     if max(h, w) <= MATRIX_LIMIT:
         return cosine_matrix(h, like=x) @ x @ cosine_matrix(w, like=x).mT
@@ -55,11 +61,16 @@ def idct2(x: Tensor) -> Tensor:
     Returns:
         (..., H, W), in the dtype and on the device of `x`.
 
+    Raises:
+        TypeError: as `dct2`.
+        ValueError: as `dct2`.
+
     Example:
         >>> x = torch.eye(5)
         >>> torch.allclose(torchdls.idct2(torchdls.dct2(x)), x, atol=1e-6)
         True
     """
+    _check("idct2", x)
     h, w = x.shape[-2:]
     if max(h, w) <= MATRIX_LIMIT:
         return cosine_matrix(h, like=x).mT @ x @ cosine_matrix(w, like=x)
@@ -70,6 +81,11 @@ def idct2(x: Tensor) -> Tensor:
     spectrum = torch.complex(head - _reverse_rows(tail), -(_reverse_rows(head) + tail))
     y = torch.fft.irfft2(spectrum * _inverse_twiddle(h, w, like=x), s=(h, w))
     return _restored(y)
+
+
+def _check(name: str, x: Tensor) -> None:
+    check_real(name, "x", x)
+    require(x.ndim >= 2 and 0 not in x.shape, f"{name}: x {tuple(x.shape)} given, (..., H, W) is needed")
 
 
 def half_spectrum(x: Tensor) -> Tensor:
