@@ -76,7 +76,7 @@ def _version(name: str) -> str | None:
 
 
 def _git(*args: str) -> str:
-    run = subprocess.run(["git", *args], cwd=ROOT, capture_output=True, text=True, check=False)
+    run = subprocess.run(["git", *args], cwd=ROOT.parent, capture_output=True, text=True, check=False)
     return run.stdout.strip()
 
 
