@@ -1,8 +1,8 @@
 """LeastSquares from 16^2 to 2048^2 beside SciPy in the same precision, and sweeps of patches as `unfold` lays them out.
 
 `python -m benchmarks.speed.small_calls` (two minutes; add --smoke). One thread; candidates take turns in one process,
-and medians are compared. "Solve alone" is what is left of a call without `nn.Module` and the checks of what comes in and
-goes out. Writes JSON and Markdown.
+and medians are compared. "Solve alone" is what is left of a call without `nn.Module` and the checks of what comes in
+and goes out. Writes JSON and Markdown.
 """
 
 from __future__ import annotations
