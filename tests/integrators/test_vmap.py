@@ -1,5 +1,6 @@
 """`vmap(grad)` of every integrator and photometric method equals a loop of gradients; so does `vmap(jvp)` of these."""
 
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -8,12 +9,12 @@ from torch.func import grad, jvp, vmap
 
 from tests.helpers import random_field, uniform_field
 from tests.helpers.methods import bumps, method, promising
-from torchdls import INTEGRATORS, low_rank_normals, ring_of_lights, sparse_normals, woodham
+from torchdls import INTEGRATORS, PhotometricResult, low_rank_normals, ring_of_lights, sparse_normals, woodham
 
 pytestmark = pytest.mark.device
 PLACES = 2
 # A few iterations: what is mapped is each of them alike.
-PHOTOMETRIC = {
+PHOTOMETRIC: dict[str, Callable[..., PhotometricResult]] = {
     "woodham": woodham,
     "sparse_normals, bayes": partial(sparse_normals, n_iter=5),
     "sparse_normals, l1": partial(sparse_normals, prior="l1", n_iter=5),
