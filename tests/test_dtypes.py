@@ -44,6 +44,7 @@ OPERATOR, PATCHES = torchdls.GradientOperator(), torchdls.Patches(4, 2)
 # How each is called; the tensors among these arguments are what is replaced. Public functions are called by name.
 CALLS = {
     "add_noise": {"gradient": field(2), "snr_db": 10.0, "mask": mask()},
+    "bivariate_normals": PHOTOMETRIC | {"n_iter": 2},
     "cast_shadows": {"height": field(1), "lights": lights()},
     "compare_heights": {"truth": field(1), "heights": {"height": field(1)}, "mask": mask(), "gradient": field(2),
                         "measured": field(2)},
@@ -52,12 +53,15 @@ CALLS = {
     "dct2": {"x": field(1)},
     "dct_dictionary": {},
     "depth_to_points": {"depth": field(1), "camera": camera()},
+    "dlnv_normals": PHOTOMETRIC | {"n_iter": 1},
+    "dlpi_normals": PHOTOMETRIC | {"n_iter": 1},
     "edge_slopes": {"gradient": field(2), "mask": mask(), "weight": field(1)},
     "gradient_to_normals": {"gradient": field(2), "camera": camera()},
     "guess_convention": NORMALS,
     "height_to_points": {"height": field(1)},
     "hillshade": {"height": field(1)},
     "idct2": {"x": field(1)},
+    "lights_from_ball": {"images": torch.rand(LIGHTS, H, W), "ball": mask()[0]},
     "log_depth_to_depth": {"log_depth": field(1), "scale": torch.ones(1, 1, 1, 1)},
     "low_rank_normals": PHOTOMETRIC,
     "mean_absolute_depth_error": {"depth": field(1), "reference": field(1), "mask": mask()},
@@ -66,10 +70,12 @@ CALLS = {
     "noise_sigma": {"gradient": field(2), "snr_db": 10.0, "mask": mask()},
     "normals_to_gradient": NORMALS,
     "orthogonal_matching_pursuit": {**patches(), "mu": torch.ones(1, 1), "tol": torch.ones(1, 1)},
+    "refine": {"height": field(1), **PHOTOMETRIC, "albedo": field(1), "n_iter": 1},
     "render": {"normals": field(3), "lights": lights(), "albedo": field(1), "shadow": mask()},
     "ring_of_lights": {},
     "rmse": MEASURED,
     "save_height": {"height": field(1), "mask": mask(), "points": field(3)},
+    "save_normals": {"normals": field(3), "mask": mask()},
     "save_mesh": {"points": field(3), "mask": mask()},
     "select": {"integrate": torchdls.LeastSquares(), "gradient": field(2), "candidates": 1, "noise": torch.ones(1)},
     "solve": {"v": field(2), "w": field(2), "anchor": field(1), "anchor_weight": field(1), "z0": field(1)},
@@ -94,7 +100,17 @@ METHODS = {
     "SURFACES": (torchdls.SURFACES["tent"], {"n": 16, "dtype": torch.float32}),
 }
 # Arguments of no tensor, or tensors of any kind: pages, paths; and these take any number of dimensions from two on.
-NO_TENSORS = {"build", "load", "load_camera", "load_field", "load_height", "load_mask", "page_html", "save"}
+NO_TENSORS = {
+    "build",
+    "load",
+    "load_camera",
+    "load_field",
+    "load_height",
+    "load_mask",
+    "load_photographs",
+    "page_html",
+    "save",
+}
 ELSEWHERE = {"dls_objective"}  # checked by the fields of the integrators
 ANY_BATCH = {("dct2", "x"), ("hillshade", "height"), ("idct2", "x")}
 # What broadcasts, or is a whole list of fields; the shapes of cameras of modules are looked at beside their field.
@@ -110,7 +126,7 @@ def entry(name):
 
 def call(name, folder, **changed):
     function, arguments = entry(name)
-    path = {"save_height": ("x.ply",), "save_mesh": ("x.ply",)}.get(name, ())
+    path = {"save_height": ("x.ply",), "save_mesh": ("x.ply",), "save_normals": ("x.npy",)}.get(name, ())
     first = [folder / p for p in path]
     return function(*first, **arguments | changed)
 

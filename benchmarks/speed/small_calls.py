@@ -20,7 +20,7 @@ from benchmarks.common.peers import ScipyPoisson
 from benchmarks.common.report import made_by, markdown_table, results_folder, write_json
 from benchmarks.common.timing import interleaved
 from benchmarks.speed.compare import noisy
-from torchdls import DLS, LeastSquares, soup_dil_sweep
+from torchdls import DLS, LeastSquares, SoupDIL, soup_dil_sweep
 from torchdls.dictionary.soup_dil import Order, residual_sweep
 from torchdls.solvers import integrate_direct
 
@@ -39,7 +39,7 @@ def least_squares(size: int, dtype: torch.dtype, seconds: float) -> dict[str, An
     candidates: dict[str, Callable[[], Any]] = {
         "torchdls": lambda: ours(g),
         "solve alone": lambda: integrate_direct(g),
-        "checks": lambda: ours.check(g),
+        "checks": lambda: ours._check_fields(g),
         "SciPy": lambda: scipy(p, q),
     }
     return {"size": size, "dtype": str(dtype).removeprefix("torch."), **medians(candidates, seconds)}
@@ -47,7 +47,7 @@ def least_squares(size: int, dtype: torch.dtype, seconds: float) -> dict[str, An
 
 def sweep(size: int, order: Order, seconds: float) -> dict[str, Any]:
     """In the middle of DLS, where codes are sparse; times in products of the dictionary with all codes."""
-    result = DLS(order=order, n_iter=4, tol=0.0).solve(noisy(size, torch.float32))
+    result = DLS(learner=SoupDIL(order), n_iter=4, tol=0.0).solve(noisy(size, torch.float32))
     D, B, mu = result.dictionary, result.codes, result.mu[:, None]
     apart = F.unfold(result.height, 8, stride=2)
     together = apart.mT.contiguous().mT
