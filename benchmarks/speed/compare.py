@@ -30,7 +30,7 @@ from benchmarks.common.peers import (
     sparse_cg,
     sparse_direct,
 )
-from benchmarks.common.report import markdown_table, replace_section, results_folder, write_json
+from benchmarks.common.report import made_by, markdown_table, replace_section, results_folder, write_json
 from benchmarks.common.timing import fresh_process, interleaved, peak_megabytes, statistics
 from torchdls import (
     DLS,
@@ -330,7 +330,8 @@ def main() -> None:
     folder: Path = results_folder(args.smoke)
     write_json(folder / "compare.json", threads=args.threads, results=results, error_against_time=curve)
     header = ("task", "candidate", "median ms", "quartiles ms", "peak MB", "ratio", "against")
-    text = summary(results) + (f"\n{CURVE}\n\n{curve_table(curve)}" if curve else "")
+    made = f"\n{made_by('benchmarks.speed.compare')}"
+    text = summary(results) + made + (f"\n{CURVE}\n\n{curve_table(curve)}{made}" if curve else "")
     (folder / "compare.md").write_text(f"{text}\n{markdown_table(header, rows(results))}")
     print(text)
     print(f"wrote {folder / 'compare.md'}")

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.common.report import replace_section, results_folder, write_json
+from benchmarks.common.report import made_by, replace_section, results_folder, write_json
 from benchmarks.common.timing import fresh_process, peak_megabytes
 from torchdls import DLS, add_noise
 from torchdls.surfaces import SURFACES
@@ -128,7 +128,8 @@ def summary(points: list[dict[str, Any]], slopes: dict[str, float]) -> str:
     share = largest["megabytes"] / largest["codes_megabytes"]
     growth = " and ".join(f"pixels^{slope:.2f} ({name.split(', ')[1]})" for name, slope in slopes.items())
     return (
-        f"![Time and memory of DLS](docs/scaling.png)\n\nAn iteration takes time in proportion to {growth}. At "
+        f"![Time and memory of DLS](docs/scaling.png)\n\n{made_by('benchmarks.speed.scaling')}\n"
+        f"An iteration takes time in proportion to {growth}. At "
         f"{largest['size']} x {largest['size']} it takes {largest['seconds']:.1f} s, and the whole run "
         f"{largest['megabytes'] / 1024:.1f} GB: {share:.1f} times the codes."
     )
