@@ -23,10 +23,20 @@ ROOMS = {
 TABLES = {"INTEGRATORS": "integrators", "LEARNERS": "dictionary", "PHOTOMETRIC": "photometric"}
 
 
+RESULTS = Path("benchmarks") / "results"
+
+
 def on_files(files: Files, config) -> Files:
-    """Add `api.md`."""
+    """Add `api.md`, and the pictures and tables of the benchmarks."""
     files.append(File.generated(config, "api.md", content=reference()))
+    for path in sorted([*RESULTS.glob("*.png"), *RESULTS.glob("*.md")]):
+        files.append(File.generated(config, f"benchmarks/{path.name}", abs_src_path=str(path.resolve())))
     return files
+
+
+def on_page_markdown(markdown: str, page, **_) -> str:
+    """Links to them, as the repository has them, lead to their places on the site."""
+    return markdown.replace("](../benchmarks/results/", "](benchmarks/").replace("](CHANGELOG.md)", "")
 
 
 def reference() -> str:

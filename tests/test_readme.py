@@ -27,7 +27,7 @@ def test_first_example_runs(capsys) -> None:
 
 
 def test_every_method_is_named() -> None:
-    text = README.read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "which.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `(\w+)` \| `(\w+)` \|", text, re.MULTILINE))
     assert rows == {name: torchdls.INTEGRATORS[name].__name__ for name in torchdls.INTEGRATORS}
 
@@ -35,6 +35,24 @@ def test_every_method_is_named() -> None:
 def test_every_convention_is_named() -> None:
     text = README.read_text(encoding="utf-8")
     assert re.findall(r'^\| `"(\w+)"` \|', text, re.MULTILINE) == [*NORMAL_CONVENTIONS]
+
+
+@pytest.mark.parametrize("path", PAGES[1:], ids=lambda path: path.name)
+def test_the_examples_of_a_page_run_one_after_the_other(path: Path) -> None:
+    names: dict = {"torch": torch, "torchdls": torchdls}
+    for example in re.findall(r"```python\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL):
+        exec(example, names)
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 140
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_links_lead_somewhere(path: Path) -> None:
+    text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
+        assert target.startswith("http") or target == "api.md" or (path.parent / target).exists(), target
 
 
 def test_every_name_of_the_package_in_the_examples_exists() -> None:
@@ -60,7 +78,7 @@ def test_every_result_names_what_made_it(path: Path) -> None:
     found = results(path.read_text(encoding="utf-8"))
     told = re.compile(r"Made by\s`(make|python -m) [^`]+` at [0-9a-f]{7,}\b")
     assert not [first for first, after in found.items() if not told.match(after)]
-    assert (path == README) == bool(found)
+    assert (path.name in ("README.md", "results.md")) == bool(found)
 
 
 def test_a_table_without_its_source_would_be_seen() -> None:

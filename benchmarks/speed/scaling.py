@@ -1,7 +1,7 @@
 """How time and memory grow: `python -m benchmarks.speed.scaling` (some minutes; add --smoke, or --largest 1024).
 
 Each point is a process of its own, so that its peak memory is its own. Prints the fitted exponent of time in pixels
-(from 128^2 to 2048^2), draws docs/scaling.png and says so in the README.
+(from 128^2 to 2048^2), draws docs/scaling.png and says so in docs/results.md.
 """
 
 from __future__ import annotations
@@ -119,11 +119,11 @@ def main() -> None:
     root = Path(__file__).resolve().parents[2]
     draw(curves, folder / "scaling.png" if args.smoke else root / "docs" / "scaling.png")
     if not args.smoke:
-        replace_section(root / "README.md", "scaling", summary(curves["pixels, 2 threads"], slopes))
+        replace_section(root / "docs" / "results.md", "scaling", summary(curves["pixels, 2 threads"], slopes))
 
 
 def summary(points: list[dict[str, Any]], slopes: dict[str, float]) -> str:
-    """What the README says of it."""
+    """What docs/results.md says of it."""
     largest = points[-1]
     share = largest["megabytes"] / largest["codes_megabytes"]
     growth = " and ".join(f"pixels^{slope:.2f} ({name.split(', ')[1]})" for name, slope in slopes.items())
