@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.noise import height_noise, noise_level
 from torchdls.operators import as_pixel_size, dct2, edge_slopes, idct2
 from torchdls.operators.tables import table
@@ -143,6 +144,7 @@ class Selection(NamedTuple):
     risk: Tensor
 
 
+@full_precision
 def select(
     integrate: Callable[[Tensor], Tensor],
     gradient: Tensor,

@@ -16,6 +16,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
 from torchdls.dictionary.thresholds import Threshold
@@ -174,6 +175,7 @@ class KSVD:
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"KSVD: {name}={value!r} given, an integer of at least 1 is needed")
 
+    @full_precision
     def __call__(
         self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
     ) -> Step:

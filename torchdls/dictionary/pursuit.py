@@ -5,9 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
+
 _CHUNK = 8192  # patches worked on at once: their rows of the Gram matrix are gathered
 
 
+@full_precision
 def orthogonal_matching_pursuit(
     P: Tensor, D: Tensor, n_nonzero: int | None = None, *, mu: float | Tensor = 0.0, tol: float | Tensor = 0.0
 ) -> Tensor:

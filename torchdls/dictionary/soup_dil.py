@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls._tracing import is_recorded
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold, shrink
 
@@ -25,6 +26,7 @@ _GROUP = 16
 _CHUNK, _SHORTEST = 65536, 4096
 
 
+@full_precision
 def soup_dil_sweep(
     P: Tensor,
     D: Tensor,
@@ -86,6 +88,7 @@ def soup_dil_sweep(
     return D, B
 
 
+@full_precision
 def residual_sweep(
     R: Tensor,
     D: Tensor,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.dictionary.thresholds import Threshold, shrink
 
 
@@ -35,6 +36,7 @@ class Unitary:
 
     threshold: Threshold = "hard"
 
+    @full_precision
     def __call__(
         self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, bound: float = math.inf, learn: bool = True
     ) -> tuple[Tensor, Tensor, Tensor]:

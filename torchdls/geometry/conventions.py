@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_field
+from torchdls._precision import full_precision
 
 # Canonical component k is sign * source[index], (index, sign) = table[name][k]: frames are signed permutations.
 Axes = tuple[tuple[int, int], ...]
@@ -28,6 +29,7 @@ GRADIENT_CONVENTIONS: dict[str, Axes] = {
 }
 
 
+@full_precision
 def convert_normals(normals: Tensor, source: str = "opengl", target: str = "opengl") -> Tensor:
     """Express normals (N, 3, H, W) or (3, H, W) of convention `source` in convention `target`.
 
@@ -42,6 +44,7 @@ def convert_normals(normals: Tensor, source: str = "opengl", target: str = "open
     return permute(permute(normals, frame[0]), inverse_axes(frame[1]))
 
 
+@full_precision
 def convert_gradient(gradient: Tensor, source: str = "image", target: str = "image") -> Tensor:
     """Express a gradient (N, 2, H, W) or (2, H, W) of convention `source` in convention `target`.
 

@@ -9,7 +9,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls._precision import full_precision
 
+
+@full_precision
 def edge_slopes(
     gradient: Tensor, mask: Tensor | None = None, weight: Tensor | None = None
 ) -> tuple[Tensor, Tensor | None]:
@@ -53,6 +56,7 @@ def edge_slopes(
     return v, both * 0.5
 
 
+@full_precision
 def slope_divergence(gradient: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
     """A^T v (N, 1, H, W) for forward differences A and the slopes v = `edge_slopes(gradient)` of equal trust.
 

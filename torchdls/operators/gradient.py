@@ -11,6 +11,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls._precision import full_precision
+
 Kernel = tuple[tuple[float, ...], ...]
 
 _TAPS: dict[str, tuple[float, ...]] = {
@@ -86,10 +88,12 @@ class GradientOperator:
             *(sum(abs(t) for row in k for t in row) / d for k, d in zip(self.kernels, self.pixel_size, strict=True))
         )
 
+    @full_precision
     def __call__(self, z: Tensor) -> Tensor:
         """Slopes (N, 2, H, W) of a height (N, 1, H, W)."""
         return torch.cat([_correlate(z, k, d) for k, d in zip(self.kernels, self.pixel_size, strict=True)], -3)
 
+    @full_precision
     def adjoint(self, g: Tensor) -> Tensor:
         """Exact transpose: (N, 2, H, W) -> (N, 1, H, W). Slopes that `__call__` leaves absent are not read."""
         gx, gy = g.split(1, -3)

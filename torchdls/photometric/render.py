@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
+from torchdls._precision import full_precision
 from torchdls.operators import as_pixel_size
 from torchdls.photometric.model import check_lights, shading
 
@@ -34,6 +35,7 @@ def ring_of_lights(
     return lights.to(dtype).to(device)
 
 
+@full_precision
 def render(
     normals: Tensor,
     lights: Tensor,
@@ -105,6 +107,7 @@ def render(
     return images if normals.ndim == 4 else images[0]
 
 
+@full_precision
 def cast_shadows(height: Tensor, lights: Tensor, pixel_size: float | Sequence[float] = 1.0) -> Tensor:
     """Where the surface itself stands between a pixel and a light.
 

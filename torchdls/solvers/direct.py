@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls._tracing import is_concrete, is_recorded
 from torchdls.operators import dct2, idct2, neumann_eigenvalues, slope_divergence
 from torchdls.operators.cosine import MATRIX_LIMIT, from_half_spectrum, half_spectrum, mirrored
@@ -131,6 +132,7 @@ class _Direct(torch.autograd.Function):
         ctx.save_for_forward(*saved)
 
     @staticmethod
+    @full_precision
     def backward(ctx: Any, dz: Tensor) -> tuple[Tensor | None, ...]:
         r, z = ctx.saved_tensors
         adjoint = _Direct.apply(dz, r, ctx.pixel_size)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls._tracing import all_finite
 from torchdls.operators import GradientOperator, as_pixel_size
 from torchdls.operators.edges import edge_ends, present_edges
@@ -72,6 +73,7 @@ class _Setting(NamedTuple):
     max_iter: int
 
 
+@full_precision
 def solve(
     v: Tensor,
     w: Tensor | None = None,
@@ -301,6 +303,7 @@ class _Solve(torch.autograd.Function):
         ctx.setting = setting
 
     @staticmethod
+    @full_precision
     def backward(ctx: Any, dz: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         z, w, r, bounds, *gauge = ctx.saved_tensors
         constants = Gauge(*gauge).constants(dz, r)
@@ -445,7 +448,7 @@ def _warn(residual: Tensor, converged: Tensor, setting: _Setting) -> None:
         f"solve: {int((~converged).sum())} of {len(converged)} surfaces stopped after {setting.max_iter} iterations "
         f"at a relative residual of up to {float(residual.max()):.1e}, above tol={setting.tol:.1e}",
         ConvergenceWarning,
-        stacklevel=6,  # the caller of `solve`
+        stacklevel=7,  # the caller of `solve`
     )
 
 

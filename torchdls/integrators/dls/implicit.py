@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls._tracing import in_plain_autograd, is_recorded
 from torchdls.dictionary.thresholds import Threshold
 from torchdls.integrators.dls.problem import Problem
@@ -120,6 +121,7 @@ class _FixedPoint(torch.autograd.Function):
         ctx.set_materialize_grads(False)
 
     @staticmethod
+    @full_precision
     def backward(ctx: Any, dz: Tensor | None, db: Tensor | None) -> tuple[Tensor | None, ...]:
         z, b, w, r, lam, D, free, valid = ctx.saved_tensors
         dz, db = torch.zeros_like(z) if dz is None else dz, None if db is None else db * free
