@@ -19,7 +19,10 @@ n = torchdls.gradient_to_normals(g)
 lights = ring_of_lights(8, 45)
 images = 0.2 + uniform_field(1, 8, 6, 5, seed=2, dtype=F32)
 camera = torch.tensor([[20.0, 0, 7], [0, 20.0, 8], [0, 0, 1]])
-P, D = random_field(1, 9, 20, seed=3, dtype=F32), torch.nn.functional.normalize(random_field(1, 9, 12, dtype=F32), dim=1)
+P, D = (
+    random_field(1, 9, 20, seed=3, dtype=F32),
+    torch.nn.functional.normalize(random_field(1, 9, 12, dtype=F32), dim=1),
+)
 B = torch.zeros(1, 12, 20)
 big = random_field(1, 1, 70, 80, seed=4, dtype=F32)
 noisy = lambda g: torchdls.add_noise(g, 10, torch.Generator().manual_seed(0))  # noqa: E731

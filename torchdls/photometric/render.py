@@ -94,7 +94,9 @@ def render(
     images = albedo * lambert.clamp(min=0)
     if highlight:
         strength = lights.norm(dim=-1, keepdim=True)
-        half = normalize(lights / strength + lights.new_tensor([0.0, 0.0, 1.0]), dim=-1)
+        half = normalize(
+            lights / strength + torch.tensor([0.0, 0.0, 1.0], dtype=lights.dtype, device=lights.device), dim=-1
+        )
         gloss = shading(n, half).clamp(min=0) ** shininess
         images = images + highlight * strength[..., None] * torch.where(lambert > 0, gloss, 0)
     if shadow is not None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdls._precision import full_precision
-from torchdls._tracing import all_finite
+from torchdls._tracing import all_finite, only_shapes
 from torchdls.operators import GradientOperator, as_pixel_size
 from torchdls.operators.edges import edge_ends, present_edges
 from torchdls.solvers.cg import CGResult, LinearMap, conjugate_gradients
@@ -143,6 +143,8 @@ def solve(
         return _finite(direct_result(_on_rectangle(v, anchor, r, setting.pixel_size)))
     w = present_edges(v) if w is None else w.expand_as(v)
     r = None if r is None else r.expand_as(v[:, :1])
+    if only_shapes(v):
+        return _shapes_alone(v, w, anchor, r)
     return _finite(_in_general(Problem(v, w, anchor, r, z0, setting.pixel_size), setting))
 
 
@@ -182,6 +184,14 @@ def _in_general(problem: Problem, setting: _Setting) -> SolveResult:
         pull = r * -level if anchor is None else r * (anchor - level)
     z, *told = _Solve.apply(force, pull, w, r, None if z0 is None else z0 - level, *found, setting)
     return SolveResult((z + lift) * unit, *told)
+
+
+def _shapes_alone(v: Tensor, w: Tensor, anchor: Tensor | None, r: Tensor | None) -> SolveResult:
+    """A result for tensors without values, linked to all of them: the iterations could not tell when to stop."""
+    z = GradientOperator().adjoint(w * v)
+    if r is not None:
+        z = z + (r if anchor is None else r * anchor)
+    return direct_result(z)
 
 
 def direct_result(z: Tensor) -> SolveResult:

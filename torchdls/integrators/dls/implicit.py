@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from torchdls._precision import full_precision
-from torchdls._tracing import in_plain_autograd, is_recorded
+from torchdls._tracing import in_plain_autograd, is_recorded, only_shapes
 from torchdls.dictionary.thresholds import Threshold
 from torchdls.integrators.dls.problem import Problem
 from torchdls.operators import GradientOperator, Patches
@@ -109,6 +109,8 @@ class _FixedPoint(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         if z is not None and b is not None:
             return z.view_as(z), b.view_as(b)
+        if only_shapes(f_z):
+            return torch.empty_like(f_z), f_z.new_empty(free.shape)
         return _System(w, r, lam, D, free, valid, setting).solve(f_z, f_b)
 
     @staticmethod

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._tracing import seen_everywhere
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.iterative import Callback, Iterative
@@ -106,7 +107,7 @@ class Robust(Iterative[RobustResult]):
             if self.tol > 0:
                 change = (objective[-1] - objective[-2]).abs() + self._gap(data, state)
                 active = active & (change > self.tol * objective[-1] + rounding)
-                if not bool(active.any()):
+                if seen_everywhere(~active):
                     break
         return RobustResult(state[0], torch.stack(objective, 1), iterations, ~active)
 
