@@ -8,6 +8,7 @@ from torch import Tensor
 from torchdls._precision import full_precision
 
 _CHUNK = 8192  # patches worked on at once
+_APART = 1e3  # in units of rounding: the least squared distance of an atom from the span of the others of a patch
 
 
 @full_precision
@@ -58,8 +59,8 @@ def orthogonal_matching_pursuit(
 def _pursue(P: Tensor, D: Tensor, limit: int, least: Tensor, enough: Tensor) -> Tensor:
     """(L, K) codes of patches (n, L) in one dictionary: the atoms are found first, then fitted, which has a derivative.
 
-    An atom stays only if the fit with it leaves less of the patch, as measured: one that depends on those before it,
-    as far as rounding lets tell, is dropped.
+    An atom stays only if the fit with it leaves less of the patch, as measured, and if it is so far from the span of
+    those before it that rounding does not decide its code.
     """
     gram, start = D.mT @ D, P.mT @ D
     codes = torch.zeros_like(start)
@@ -89,14 +90,23 @@ def _supports(
             return done
         atoms, kept = (torch.cat([t[go], new[go, None]], 1) for t, new in ((atoms, atom), (kept, atom >= 0)))
         inner, target = _equations(gram, start[rows], atoms, kept)
-        x, failed = torch.linalg.solve_ex(inner, target)
+        last = torch.zeros_like(target)
+        last[:, -1] = 1
+        (x, inverse), failed = _solve_two(inner, target, last)
         residual = P.mT[rows] - torch.zeros_like(old).scatter(1, atoms, x) @ D.mT
         left = residual.square().sum(1)
-        better = (left < before) & (failed == 0)
+        apart = 1 / inverse[:, -1]  # squared distance of the atom from those before it
+        better = (left < before) & (apart > _APART * torch.finfo(P.dtype).eps) & (failed == 0)
         kept[:, -1] = better
         left = torch.where(better, left, before)
         correlation = torch.where(better[:, None], residual @ D, old)
     return [*done, (rows, atoms, kept)]
+
+
+def _solve_two(inner: Tensor, a: Tensor, b: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+    """The solutions for two right-hand sides, and where there are none (not 0)."""
+    found, failed = torch.linalg.solve_ex(inner, torch.stack([a, b], 2))
+    return found.unbind(2), failed
 
 
 def _equations(gram: Tensor, start: Tensor, atoms: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
