@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_field, check_fit, require
+from torchdls._precision import full_precision
 from torchdls._statistics import NORMAL_MEDIAN
 from torchdls._tracing import holds_everywhere
 from torchdls.operators import as_pixel_size, dst2, edge_slopes
@@ -21,6 +22,7 @@ _KEPT = math.erf(_CUT / math.sqrt(2))
 _TRIMMED_VARIANCE = 1 - _CUT * math.sqrt(2 / math.pi) * math.exp(-_CUT * _CUT / 2) / _KEPT  # of a cut standard normal
 
 
+@full_precision
 def noise_level(
     gradient: Tensor,
     mask: Tensor | None = None,
@@ -285,6 +287,7 @@ def _projected_spectra(n: int, pixel_size: tuple[float, float]) -> tuple[Tensor,
     return xx, yy, g_x * g_y.conj() * q
 
 
+@full_precision
 def noise_sigma(gradient: Tensor, snr_db: float, mask: Tensor | None = None) -> Tensor:
     """Standard deviation of the noise on one gradient sample at a signal-to-noise ratio.
 
@@ -327,6 +330,7 @@ def noise_sigma(gradient: Tensor, snr_db: float, mask: Tensor | None = None) -> 
     return power.sqrt() * 10 ** (-snr_db / 20)
 
 
+@full_precision
 def add_noise(
     gradient: Tensor, snr_db: float, generator: torch.Generator | None = None, mask: Tensor | None = None
 ) -> Tensor:

@@ -17,6 +17,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold
@@ -211,6 +212,7 @@ class KSVD:
     def __post_init__(self) -> None:
         check_options(self)
 
+    @full_precision
     def __call__(self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, learn: bool = True) -> Step:
         """One pass: pursuit, then atoms."""
         N, _, L = R.shape

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdls._checks import check_field
+from torchdls._precision import full_precision
 
 Kernel = tuple[tuple[float, ...], ...]
 
@@ -88,11 +89,13 @@ class GradientOperator:
             *(sum(abs(t) for row in k for t in row) / d for k, d in zip(self.kernels, self.pixel_size, strict=True))
         )
 
+    @full_precision
     def __call__(self, z: Tensor) -> Tensor:
         """Slopes (N, 2, H, W) of a height (N, 1, H, W); TypeError or ValueError if it is not one."""
         check_field("GradientOperator", "z", z, 1)
         return torch.cat([_correlate(z, k, d) for k, d in zip(self.kernels, self.pixel_size, strict=True)], -3)
 
+    @full_precision
     def adjoint(self, g: Tensor) -> Tensor:
         """Exact transpose: (N, 2, H, W) -> (N, 1, H, W). Slopes that `__call__` leaves absent are not read."""
         check_field("GradientOperator", "g", g, 2)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_alike, check_dtype, check_field, check_real, require
+from torchdls._precision import full_precision
 from torchdls._tracing import is_recorded
 
 
@@ -91,6 +92,7 @@ class Patches:
         last = count - 1 if high >= last_start else high // stride
         return slice(min(first * stride, last_start), min(last * stride, last_start) + size), slice(first, last + 1)
 
+    @full_precision
     def extract(self, z: Tensor) -> Tensor:
         """All patches: (N, 1, H, W) -> (N, n, L), L = rows * columns of `grid`; each patch is contiguous in memory.
 
@@ -100,6 +102,7 @@ class Patches:
         require(z.ndim == 4, f"Patches: z {tuple(z.shape)} given, (N, 1, H, W) is needed")
         return self._gather(z) if torch.compiler.is_compiling() else _Extract.apply(z, self)
 
+    @full_precision
     def adjoint(self, x: Tensor, shape: Sequence[int]) -> Tensor:
         """Exact transpose, summing overlaps: (N, n, L) -> (N, 1, H, W), with (H, W) the last two of `shape`."""
         size = (shape[-2], shape[-1])

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchdls._registry import LEARNERS
+from torchdls._tracing import holds_everywhere
 from torchdls.dictionary.learners import DinoKat, FixedDictionary, Learner, SoupDIL
 from torchdls.integrators.dls.options import DERIVATIVES, HEIGHT_STEPS, Exact, Implicit, Proximal, Unroll, meant
 from torchdls.operators import Patches
@@ -146,5 +147,5 @@ def check_dictionary(dictionary: Tensor, patches: Patches) -> None:
         wanted = f"(n, K) or (N, n, K) with n = {patches.n_pixels}"
         raise ValueError(f"DLS: dictionary {tuple(dictionary.shape)} given, {wanted} is needed")
     norms = dictionary.detach().norm(dim=-2)
-    if not bool((norms.isfinite() & (norms > 0)).all()):
+    if not holds_everywhere(norms.isfinite() & (norms > 0)):
         raise ValueError("DLS: dictionary has an atom that is zero or not finite")
