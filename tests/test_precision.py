@@ -1,6 +1,7 @@
 """Every function of tensors gives inside `torch.autocast` what it gives outside, for half-precision tensors too."""
 
 import inspect
+from typing import Any
 
 import pytest
 import torch
@@ -28,7 +29,7 @@ big = random_field(1, 1, 70, 80, seed=4, dtype=F32)
 noisy = lambda g: torchdls.add_noise(g, 10, torch.Generator().manual_seed(0))  # noqa: E731
 
 # name -> function of tensors, and the tensors
-CALLS = {
+CALLS: dict[str, tuple[Any, ...]] = {
     "add_noise": (noisy, g),
     "cast_shadows": (torchdls.cast_shadows, z, lights),
     "convert_gradient": (lambda g: torchdls.convert_gradient(g, "depth"), g),
@@ -126,7 +127,7 @@ def test_surfaces_are_made_in_full_precision():
 
 def test_every_kind_of_autocast_is_switched_off():
     """Of devices that are not here too: a model may run under one of them and integrate on the CPU."""
-    seen = []
+    seen: list[bool] = []
 
     @full_precision
     def look(x, *, more):

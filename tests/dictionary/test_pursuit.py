@@ -16,7 +16,8 @@ def nearly_dependent(seed, gap=1e-5):
 
 def pursued(D, p, steps):
     """|r|^2 of one patch after so many steps, by least squares over the atoms taken."""
-    residual, taken = p, []
+    residual = p
+    taken: list[int] = []
     for _ in range(steps):
         size = (D.mT @ residual).abs()
         size[taken] = -1

@@ -107,7 +107,6 @@ METHODS: dict[str, Method] = {
     "dls": Method(
         {"patch_size": 4, "stride": 2, "n_atoms": 16, "mu": 0.3, "n_iter": 3, "tol": 0.0, "unused": "keep"},
         tol=1e-4,
-        smallest=4,
         no={
             **ONE_DICTIONARY,
             "plane_is_exact": "codes below mu are lost; it holds for mu='auto' and order='block' (see test_dls.py)",

@@ -1,5 +1,7 @@
 """Tensors without values, graphs for every batch size, and views that PyTorch has not yet written down."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch._subclasses import FakeTensorMode
@@ -7,7 +9,7 @@ from torch.func import functional_call
 
 import torchdls
 from tests.helpers import MASKS, random_field, uniform_field
-from tests.helpers.methods import bumps, everything, method
+from tests.helpers.methods import Options, bumps, everything, method
 from torchdls import DLS, INTEGRATORS, LeastSquares, SlopeDLS
 from torchdls.operators import dct2
 from torchdls.selection import _bands, _most_bands
@@ -20,7 +22,7 @@ def fixed(name, **more):
     return method(name).build(name, **{**steps, **more})
 
 
-FORMS = [(name, {}) for name in INTEGRATORS]
+FORMS: list[tuple[str, Options]] = [(name, {}) for name in INTEGRATORS]
 FORMS += [("dls", {"learn": "fixed"}), ("dls", {"select": True, "mu": "auto"}), ("dls", {"checkpoint": True})]
 FORMS += [("dls", {"z_step": "proximal"}), ("dls", {"learner": "dino_kat", "unused": "first"})]
 FORMS += [("dls", {"learn": "shared"}), ("m_estimator", {"tol": 1e-3})]
@@ -138,7 +140,7 @@ def test_negative_views_elsewhere():
     g, z = bumps(1).float(), random_field(1, 1, 16, 14, dtype=torch.float32)
     lights, images = torchdls.ring_of_lights(8, 45), 0.2 + uniform_field(1, 8, 6, 5, dtype=torch.float32)
     n = torchdls.gradient_to_normals(g)
-    calls = [
+    calls: list[tuple[Any, torch.Tensor]] = [
         (torchdls.noise_level, g), (dct2, z), (lambda x: torchdls.normals_to_gradient(x).gradient, n),
         (torchdls.gradient_to_normals, g), (lambda x: torchdls.select(torchdls.HarkerOLeary(), x, 1).height, g),
         (lambda x: torchdls.render(n, x, highlight=0.5), lights), (lambda x: torchdls.cast_shadows(z, x), lights),

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchdls._tracing import in_plain_autograd, is_concrete
+from torchdls._tracing import in_plain_autograd, is_concrete, seen_everywhere
 from torchdls.dictionary import dct_dictionary
 from torchdls.dictionary.learners import FixedDictionary, Learner
 from torchdls.dictionary.soup_dil import Order, Unused
@@ -28,7 +28,6 @@ from torchdls.integrators.dls.settings import (
     check_combination,
     check_dictionary,
     check_options,
-    check_size,
     check_strength,
     choose_learner,
     per_surface,
@@ -37,7 +36,7 @@ from torchdls.integrators.dls.settings import (
 )
 from torchdls.integrators.dls.window import live_window
 from torchdls.integrators.iterative import Callback, Iterative
-from torchdls.noise import noise_level
+from torchdls.noise import noise_if_told
 from torchdls.operators import GradientOperator, Patches
 from torchdls.solvers import harmonic_extension, remove_free_constants, solve
 
@@ -104,7 +103,8 @@ class DLS(Iterative[DLSResult]):
         n_atoms: K, the number of atoms of the initial DCT dictionary; ignored if `dictionary` is given.
         lam: weight of the patch model; a number, a tensor (a number or one per surface), or "auto" (0.5).
         mu: threshold on the codes; a number, a tensor (a number or one per surface), or "auto": the noise
-            level of one gradient sample, which `noise_level` estimates from the non-integrable part of each field.
+            level of one gradient sample, which `noise_level` estimates from the non-integrable part of each field;
+            where there is none, or no cell of 2 x 2 pixels tells it, the height is that of the data term alone.
         n_iter: limit of iterations.
         data_term: an integrator built on the solve (*), which provides the data term and the first height.
         dictionary: initial dictionary (n, K), or (N, n, K) for each surface of a batch; atoms are brought to unit
@@ -219,8 +219,9 @@ class DLS(Iterative[DLSResult]):
 
     def iterate(self, fields: Fields, callback: Callback | None = None) -> DLSResult:
         """The iterations, within the window of the patches that a mask leaves alive."""
-        check_size(fields.gradient, self.patches)
         noise = self._noise(fields)
+        if not self.patches.fit(fields.gradient.shape) or (isinstance(self.mu, str) and seen_everywhere(~(noise > 0))):
+            return self._without_patches(fields, noise)
         window = live_window(fields.mask, self.patches)
         fields = fields if window is None else window.crop(fields)
         model = self._model(fields, noise)
@@ -231,6 +232,19 @@ class DLS(Iterative[DLSResult]):
         if window is None:
             return result._replace(height=height)
         return result._replace(height=window.put_back(height), codes=window.put_codes_back(result.codes))
+
+    def _without_patches(self, fields: Fields, noise: Tensor) -> DLSResult:
+        """The surface of the data term alone, where no patch fits or none has noise to lose: nothing to iterate."""
+        z, D = self.data_term.integrate(fields), self._initial_dictionary(fields)
+        cost = self.data_term.data_cost(fields, z)
+        if fields.anchor is not None and fields.anchor_weight is not None:
+            cost = cost + 0.5 * (fields.anchor_weight * (z - fields.anchor).square()).sum((-3, -2, -1))
+        rows, columns = self.patches.grid(z.shape) if self.patches.fit(z.shape) else (0, 0)
+        codes = z.new_zeros(len(z), D.shape[-1], rows * columns)
+        costs = cost[:, None].expand(-1, self.n_iter + 1)
+        nothing = torch.zeros_like(noise)
+        lam, mu = (per_surface(name, getattr(self, name), nothing) for name in ("lam", "mu"))
+        return DLSResult(z, D, codes, costs, noise, 0 * lam, mu, nothing == 0, nothing.long())
 
     def _differentiated(self, model: Problem, callback: Callback | None) -> DLSResult:
         """The result of the iterations, with the derivative that was chosen."""
@@ -339,6 +353,8 @@ class DLS(Iterative[DLSResult]):
         shape, N = gradient.shape[-2:], gradient.shape[0]
         lam = per_surface("lam", self.lam, _AUTO_LAM * torch.ones_like(noise))
         mu = per_surface("mu", self.mu, _AUTO_MU * noise)
+        if isinstance(self.mu, str):  # where there is no noise, or nothing tells it: least squares
+            lam, mu = (torch.where(noise > 0, t, 0) for t in (lam, mu))
         coverage = self.patches.coverage(shape, dtype=gradient.dtype, device=gradient.device)
         edges = self.data_term.edges(fields) if self._steady else None
         if mask is None:
@@ -349,19 +365,13 @@ class DLS(Iterative[DLSResult]):
         return Problem(fields, self.patches, coverage * mask, valid.expand(N, -1, -1), edges, noise, lam, mu)
 
     def _noise(self, fields: Fields) -> Tensor:
-        """(N,) noise of a gradient sample of mean weight; NaN where it cannot be told and mu does not need it."""
+        """(N,) noise of a gradient sample of mean weight; NaN where nothing tells it."""
         weight = fields.weight
         if weight is not None:  # a common factor of the weights is no news about the noise
             count = (weight > 0).sum((-3, -2, -1), keepdim=True).clamp(min=1)
             weight = weight * count / weight.sum((-3, -2, -1), keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
-        try:
-            return noise_level(fields.gradient, fields.mask, weight, fields.steps)
-        except ValueError as error:
-            if isinstance(self.mu, str):
-                raise ValueError(f"DLS: mu='auto' finds no noise level, give a number ({error})") from error
-            if self.select:
-                raise ValueError(f"DLS: select=True finds no noise level ({error})") from error
-            return fields.gradient.new_full((len(fields.gradient),), math.nan)
+        level, told = noise_if_told(fields.gradient, fields.mask, weight, fields.steps)
+        return torch.where(told, level, math.nan)
 
     @property
     def _steady(self) -> bool:
