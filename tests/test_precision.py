@@ -29,7 +29,7 @@ big = random_field(1, 1, 70, 80, seed=4, dtype=F32)
 noisy = lambda g: torchdls.add_noise(g, 10, torch.Generator().manual_seed(0))  # noqa: E731
 
 # name -> function of tensors, and the tensors
-CALLS: dict[str, Any] = {
+CALLS: dict[str, tuple[Any, ...]] = {
     "add_noise": (noisy, g),
     "cast_shadows": (torchdls.cast_shadows, z, lights),
     "convert_gradient": (lambda g: torchdls.convert_gradient(g, "depth"), g),

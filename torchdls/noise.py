@@ -83,22 +83,38 @@ def noise_level(
         >>> round(float(torchdls.noise_level(noisy)), 2)
         0.1
     """
-    dx, dy = as_pixel_size(pixel_size)
-    _check(gradient, mask, weight)
+    steps = as_pixel_size(pixel_size)
     single = gradient.ndim == 3
     if single:
         gradient = gradient[None]
         mask, weight = (None if t is None else t[None] for t in (mask, weight))
+    _check(gradient, mask, weight)
+    sigma, told = noise_if_told(gradient, mask, weight, steps)
+    if not holds_everywhere(told):
+        raise ValueError("noise_level: a mask (or the positive weights) holds no complete cell of 2 x 2 pixels")
+    return sigma[0] if single else sigma
+
+
+def noise_if_told(
+    gradient: Tensor, mask: Tensor | None, weight: Tensor | None, pixel_size: tuple[float, float]
+) -> tuple[Tensor, Tensor]:
+    """`noise_level` of checked fields (N,), and whether a cell tells it (N,): 0 where none does.
+
+    Fields of a single row or column have no cell; a mask may leave none.
+    """
+    n, (dx, dy) = len(gradient), pixel_size
+    if min(gradient.shape[-2:]) < 2:
+        return gradient.new_zeros(n), torch.zeros(n, dtype=torch.bool, device=gradient.device)
     v, w = edge_slopes(gradient, mask, weight)
     curl = cell_curl(v, (dx, dy))
     scale = math.hypot(dx, dy)
     if w is None:
         sigma = torch.minimum(_robust_scale(curl / scale), _spectral_scale(curl, dx, dy))
-    else:
-        unit, cells = _normalised(curl, w, dx, dy)
-        local, spectral = _robust_scale(unit, cells), _spectral_scale(unit * scale, dx, dy)
-        sigma = torch.where(_stationary(mask, weight), torch.minimum(local, spectral), local)
-    return sigma[0] if single else sigma
+        return sigma, torch.ones(n, dtype=torch.bool, device=gradient.device)
+    unit, cells = _normalised(curl, w, dx, dy)
+    local, spectral = _robust_scale(unit, cells), _spectral_scale(unit * scale, dx, dy)
+    sigma = torch.where(_stationary(mask, weight), torch.minimum(local, spectral), local)
+    return sigma, cells.flatten(1).any(1)
 
 
 def _normalised(curl: Tensor, w: Tensor, dx: float, dy: float) -> tuple[Tensor, Tensor]:
@@ -109,8 +125,6 @@ def _normalised(curl: Tensor, w: Tensor, dx: float, dy: float) -> tuple[Tensor, 
     """
     edges = cell_edges(w)
     cells = (edges > 0).all(1)
-    if not holds_everywhere(cells.flatten(1).any(1)):
-        raise ValueError("noise_level: a mask (or the positive weights) holds no complete cell of 2 x 2 pixels")
     halves = 0.5 / torch.where(cells[:, None], edges, 1)
     variance = dx * dx * halves[:, :2].sum(1) + dy * dy * halves[:, 2:].sum(1)
     return torch.where(cells, curl, 0) / variance.sqrt(), cells
@@ -142,7 +156,7 @@ def _robust_scale(x: Tensor, valid: Tensor | None = None) -> Tensor:
     limit = _CUT * candidates.flatten(1).nanmedian(1).values / NORMAL_MEDIAN
     kept = candidates <= limit[:, None, None]
     norm = torch.linalg.vector_norm(torch.where(kept, x, 0), dim=(-2, -1))  # derivative 0, not NaN, at 0
-    return norm / (_TRIMMED_VARIANCE * kept.sum((-2, -1), dtype=x.dtype)).sqrt()
+    return norm / (_TRIMMED_VARIANCE * kept.sum((-2, -1), dtype=x.dtype).clamp(min=1)).sqrt()
 
 
 @table

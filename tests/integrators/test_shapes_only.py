@@ -11,6 +11,8 @@ import torchdls
 from tests.helpers import MASKS, random_field, uniform_field
 from tests.helpers.methods import bumps, everything, method
 from torchdls import DLS, INTEGRATORS, LeastSquares, SlopeDLS, Unroll
+from tests.helpers.methods import Options, bumps, everything, method
+from torchdls import DLS, INTEGRATORS, LeastSquares, SlopeDLS
 from torchdls.operators import dct2
 from torchdls.selection import _bands, _most_bands
 

@@ -169,7 +169,7 @@ def _correlate(z: Tensor, kernel: Kernel, spacing: float) -> Tensor:
     h, w = z.shape[-2:]
     margins = _margins(taps, top, left)
     if not _fits(margins, h, w):
-        return torch.zeros_like(z)
+        return F.pad(z[..., :0], (0, w))  # zeros of which z is still a variable
     rows, columns = _window(taps, top, left, h, w)
     window = z[..., rows, columns]
     if pair := _two_taps(taps):
@@ -189,7 +189,7 @@ def _correlate_transpose(g: Tensor, kernel: Kernel, spacing: float) -> Tensor:
     h, w = g.shape[-2:]
     margins = _margins(taps, top, left)
     if not _fits(margins, h, w):
-        return torch.zeros_like(g)
+        return F.pad(g[..., :0], (0, w))
     g = g[..., margins[2] : h - margins[3], margins[0] : w - margins[1]]
     if pair := _two_taps(taps):
         dim, first, last = pair

@@ -71,10 +71,14 @@ class Patches:
     def grid(self, shape: Sequence[int]) -> tuple[int, int]:
         """Patches down and across an image of shape (.., H, W); ValueError if it is smaller than a patch."""
         h, w = shape[-2:]
-        if h < self._size[0] or w < self._size[1]:
+        if not self.fit(shape):
             raise ValueError(f"image of {h} x {w} pixels is smaller than a patch of {self._size[0]} x {self._size[1]}")
         rows, columns = ((m - p + s - 1) // s + 1 for m, p, s in zip((h, w), self._size, self._stride, strict=True))
         return rows, columns
+
+    def fit(self, shape: Sequence[int]) -> bool:
+        """Whether an image of shape (.., H, W) holds a patch."""
+        return all(m >= p for m, p in zip(shape[-2:], self._size, strict=True))
 
     def tile(self, shape: Sequence[int]) -> bool:
         """Whether the patches of an image of shape (.., H, W) lie side by side: every pixel is in one of them."""

@@ -131,14 +131,6 @@ def per_surface(name: str, value: float | Tensor | Sequence[float] | str, auto: 
     return value.reshape(-1).expand(auto.shape)
 
 
-def check_size(gradient: Tensor, patches: Patches) -> None:
-    """ValueError if the field is smaller than a patch."""
-    try:
-        patches.grid(gradient.shape)
-    except ValueError as error:
-        raise ValueError(f"DLS: gradient {tuple(gradient.shape)}: {error}") from error
-
-
 def check_dictionary(dictionary: Tensor, patches: Patches) -> None:
     """The initial dictionary must fit the patches and have no atom that is zero."""
     if not isinstance(dictionary, Tensor):
