@@ -27,7 +27,7 @@ BENCH_SCRIPTS := $(filter-out $(BENCH_TESTS),$(wildcard benchmarks/speed/*.py be
 SMOKE_SIZES := not 512 and not 1024 and not 2048 and not 64-64
 NOTEBOOKS := $(patsubst notebooks/%.py,%,$(wildcard notebooks/*.py))
 
-.PHONY: help demo test test-slow lint format types notebooks notebooks-update picture bench-smoke check check-rest clean
+.PHONY: help demo test test-slow docs lint format types notebooks notebooks-update picture bench-smoke check check-rest clean
 .DELETE_ON_ERROR:
 
 help:
@@ -70,6 +70,10 @@ picture: demo
 	$(BIN)/python -c "from PIL import Image; p = Image.open('$(DEMO)/terrain.png').convert('RGB'); \
 	p.resize((900, p.height * 900 // p.width), Image.Resampling.LANCZOS).quantize(256).save('docs/demo.png', optimize=True)"
 
+# The site, into build/site; a broken link or name stops it.
+docs: $(VENV)/.dev
+	$(BIN)/mkdocs build --strict --quiet
+
 bench-smoke: $(VENV)/.dev
 	$(if $(BENCH_TESTS),$(BIN)/python -m pytest --benchmark-disable --quiet -k "$(SMOKE_SIZES)" $(BENCH_TESTS))
 	@set -e; for module in $(subst /,.,$(BENCH_SCRIPTS:.py=)); do echo "$$module --smoke"; \
@@ -77,7 +81,7 @@ bench-smoke: $(VENV)/.dev
 
 check: test check-rest
 
-check-rest: test-slow lint types notebooks bench-smoke
+check-rest: test-slow lint types docs notebooks bench-smoke
 
 clean:
 	rm -rf $(SCRATCH) $(DEMO) .mypy_cache .pytest_cache .ruff_cache

@@ -352,7 +352,7 @@ def test_nothing_is_made_on_the_default_device():
         (ValueError, r"mask \(1, 4, 3\) differ in width", lambda n: normals_to_gradient(n, mask=n[:1, :, :3] > 0)),
         (TypeError, "mask has dtype torch.float32", lambda n: normals_to_gradient(n, mask=n[:1])),
         (ValueError, r"camera: shape \(2, 3, 3\)", lambda n: normals_to_gradient(n, camera=torch.ones(2, 3, 3))),
-        (TypeError, "camera: torch.int64", lambda n: normals_to_gradient(n, camera=torch.eye(3).long())),
+        (TypeError, "camera: K has dtype torch.int64", lambda n: normals_to_gradient(n, camera=torch.eye(3).long())),
         (ValueError, "camera: K is singular", lambda n: normals_to_gradient(n, camera=torch.zeros(3, 3))),
         (ValueError, "pixel_size: 0", lambda n: normals_to_gradient(n, pixel_size=0)),
         (ValueError, "beside a camera", lambda n: normals_to_gradient(n, camera=torch.eye(3), pixel_size=2.0)),

@@ -151,7 +151,7 @@ def test_bad_sizes(make, n, error):
 
 
 def test_bad_dtype():
-    with pytest.raises(ValueError, match="float16"):
+    with pytest.raises(TypeError, match="float16"):
         tent(8, dtype=torch.float16)
 
 
@@ -229,7 +229,7 @@ def test_bad_noise_arguments():
     g = tent(8).gradient
     with pytest.raises(ValueError, match="snr_db: nan"):
         add_noise(g, math.nan)
-    with pytest.raises(ValueError, match=r"gradient: \(1, 3, 8, 8\)"):
+    with pytest.raises(ValueError, match=r"gradient \(1, 3, 8, 8\)"):
         noise_sigma(torch.zeros(1, 3, 8, 8), 1)
-    with pytest.raises(ValueError, match=r"mask \(1, 1, 8, 7\).*\(1, 2, 8, 8\)"):
+    with pytest.raises(ValueError, match=r"gradient \(1, 2, 8, 8\) and mask \(1, 1, 8, 7\) differ in width"):
         noise_sigma(g, 1, torch.ones(1, 1, 8, 7, dtype=torch.bool))

@@ -25,6 +25,20 @@ def check_real(name: str, label: str, field: Tensor) -> None:
         raise TypeError(f"{name}: {label} has dtype {field.dtype}; float32 or float64 is needed")
 
 
+def check_alike(name: str, label: str, field: Tensor, dtype: torch.dtype) -> None:
+    """A tensor of this dtype, such as that of the field beside it."""
+    if not isinstance(field, Tensor):
+        raise TypeError(f"{name}: {label} is a {type(field).__name__}, a tensor is needed")
+    if field.dtype != dtype:
+        raise TypeError(f"{name}: {label} has dtype {field.dtype}, {dtype} is needed")
+
+
+def check_dtype(name: str, dtype: torch.dtype) -> None:
+    """float32 or float64, asked for of a result."""
+    if dtype not in REAL:
+        raise TypeError(f"{name}: dtype is {dtype}; torch.float32 or torch.float64 is needed")
+
+
 def check_field(name: str, label: str, field: Tensor, channels: int) -> None:
     """A tensor (N, channels, H, W) or (channels, H, W) of float32 or float64 that is not empty."""
     check_real(name, label, field)
@@ -56,11 +70,7 @@ def check_fit(
         dtype: that of `like` for None.
         scalar: whether 1 x 1 pixels do as well.
     """
-    if not isinstance(field, Tensor):
-        raise TypeError(f"{name}: {label} is a {type(field).__name__}, a tensor is needed")
-    dtype = like.dtype if dtype is None else dtype
-    if field.dtype != dtype:
-        raise TypeError(f"{name}: {label} has dtype {field.dtype}, {dtype} is needed")
+    check_alike(name, label, field, like.dtype if dtype is None else dtype)
     if field.device != like.device:
         raise ValueError(f"{name}: {label} is on {field.device}, {like_label} on {like.device}")
     sizes = (tuple(like.shape[-2:]), (1, 1)) if scalar else (tuple(like.shape[-2:]),)

@@ -210,6 +210,6 @@ def as_array(value: Tensor | Array | float) -> Array:
 
 def single_map(name: str, tensor: Tensor) -> Array:
     array = as_array(tensor)
-    if array.ndim < 2 or array.size != np.prod(array.shape[-2:]) or not array.size:
+    if array.ndim not in (2, 3, 4) or array.size != np.prod(array.shape[-2:]) or not array.size:
         raise ValueError(f"{name}: shape {tuple(array.shape)} given, one surface (1, 1, H, W) or (H, W) is needed")
     return array.reshape(array.shape[-2:])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isfinite
+
 import torch
 from torch import Tensor
 
@@ -53,4 +55,4 @@ def all_finite(field: Tensor) -> bool:
 
     True where values cannot be seen.
     """
-    return not is_concrete(field) or bool(field.detach().sum().isfinite()) or bool(field.isfinite().all())
+    return not is_concrete(field) or isfinite(field.detach().sum().item()) or bool(field.isfinite().all())

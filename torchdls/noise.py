@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchdls._checks import check_field, check_fit
+from torchdls._checks import check_field, check_fit, require
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls._tracing import holds_everywhere
 from torchdls.operators import as_pixel_size, dst2, edge_slopes
@@ -82,11 +82,11 @@ def noise_level(
         0.1
     """
     dx, dy = as_pixel_size(pixel_size)
+    _check(gradient, mask, weight)
     single = gradient.ndim == 3
     if single:
         gradient = gradient[None]
         mask, weight = (None if t is None else t[None] for t in (mask, weight))
-    _check(gradient, mask, weight)
     v, w = edge_slopes(gradient, mask, weight)
     curl = cell_curl(v, (dx, dy))
     scale = math.hypot(dx, dy)
@@ -156,7 +156,7 @@ def _high_modes(h: int, w: int) -> Tensor:
 
 def _check(gradient: Tensor, mask: Tensor | None, weight: Tensor | None) -> None:
     check_field("noise_level", "gradient", gradient, 2)
-    if gradient.ndim != 4 or min(gradient.shape[2:]) < 2:
+    if min(gradient.shape[-2:]) < 2:
         shape = tuple(gradient.shape)
         raise ValueError(f"noise_level: gradient {shape} given, (N, 2, H, W) of at least 2 x 2 pixels is needed")
     if mask is not None:
@@ -304,22 +304,24 @@ def noise_sigma(gradient: Tensor, snr_db: float, mask: Tensor | None = None) -> 
         (N,), or () for an unbatched gradient.
 
     Raises:
-        ValueError: the gradient has no two components, the shapes differ, or `snr_db` is not finite.
+        TypeError: the gradient is not float32 or float64, or the mask is not bool.
+        ValueError: the gradient has no two components, the shapes differ, a surface has no pixel in the mask, or
+            `snr_db` is not finite.
 
     Example:
         >>> torchdls.noise_sigma(torch.ones(1, 2, 4, 4), snr_db=20)
         tensor([0.1000])
     """
-    if gradient.ndim not in (3, 4) or gradient.shape[-3] != 2:
-        raise ValueError(f"gradient: {tuple(gradient.shape)} given, (N, 2, H, W) or (2, H, W) is needed")
+    check_field("noise_sigma", "gradient", gradient, 2)
     if not math.isfinite(snr_db):
         raise ValueError(f"snr_db: {snr_db} given, a finite number of decibels is needed")
     square = gradient.square()
     if mask is None:
         power = square.mean((-3, -2, -1))
     else:
-        if mask.ndim != gradient.ndim or mask.shape[-2:] != gradient.shape[-2:]:
-            raise ValueError(f"mask {tuple(mask.shape)} does not fit the gradient {tuple(gradient.shape)}")
+        check_fit("noise_sigma", "mask", mask, gradient, "gradient", channels=(1,), dtype=torch.bool)
+        some = holds_everywhere(mask.flatten(-3).any(-1))
+        require(some, f"noise_sigma: mask {tuple(mask.shape)} is False everywhere on a surface")
         inside = mask.expand_as(gradient)
         power = torch.where(inside, square, 0).sum((-3, -2, -1)) / inside.sum((-3, -2, -1))
     return power.sqrt() * 10 ** (-snr_db / 20)
@@ -344,6 +346,7 @@ def add_noise(
         The noisy gradient, in the shape and dtype of `gradient`.
 
     Raises:
+        TypeError: as `noise_sigma`.
         ValueError: as `noise_sigma`.
 
     Example:

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchdls._checks import check_alike, check_field, check_real
 from torchdls._files import require
 from torchdls.geometry import gradient_to_normals
 from torchdls.metrics import describe
@@ -45,11 +46,16 @@ def hillshade(
         azimuth: degrees clockwise from the top of the image; 315 is the upper left.
         altitude: degrees above the image plane.
 
+    Raises:
+        TypeError: the height is not float32 or float64.
+        ValueError: its shape is wrong.
+
     Example:
         >>> shade = torchdls.hillshade(torch.zeros(4, 5), altitude=30)  # flat: the sine of the altitude everywhere
         >>> shade.shape, round(float(shade[0, 0]), 2)
         (torch.Size([4, 5]), 0.5)
     """
+    check_real("hillshade", "height", height)
     if height.ndim < 2 or min(height.shape[-2:]) < 2:
         raise ValueError(f"height: shape {tuple(height.shape)} given, (..., H, W) of at least 2 x 2 pixels is needed")
     down, right = torch.gradient(height, dim=(-2, -1))
@@ -89,6 +95,7 @@ def compare_heights(
         unit: of the heights, for the labels.
 
     Raises:
+        TypeError: a field is not float32 or float64, or the mask is not bool.
         ValueError: there is no height, or the shapes differ.
         ImportError: matplotlib is missing.
 
@@ -105,6 +112,9 @@ def compare_heights(
 
     planes = _planes(truth, heights, mask)
     columns, (h, w) = len(planes), next(iter(planes.values())).shape
+    for label, slopes in (("gradient", gradient), ("measured", measured)):
+        if slopes is not None:
+            _check_slopes(label, slopes, (h, w))
     ratio = h * pixel_size[1] / (w * pixel_size[0])
     side = min(3.6, 3.6 / ratio)
     figure = Figure(figsize=(columns * side + 0.9, side * ratio * 1.9 + 1.5), facecolor="white", layout="constrained")
@@ -159,6 +169,7 @@ def surface_page(
         max_side: most samples along a side.
 
     Raises:
+        TypeError: a height is not float32 or float64, or the mask is not bool.
         ValueError: there is no height, the shapes differ, or `max_side` is below 2.
         ImportError: plotly is missing.
 
@@ -270,11 +281,15 @@ def _planes(truth: Tensor | None, heights: Mapping[str, Tensor], mask: Tensor | 
     fields = ({} if truth is None else {"Ground truth": truth}) | dict(heights)
     if not heights:
         raise ValueError("heights: none given, at least one is needed")
+    for name, field in fields.items():
+        check_real("heights", name, field)
     planes: dict[str, _Plane] = {}
     shape = tuple(next(iter(fields.values())).shape[-2:])
+    if mask is not None:
+        check_alike("heights", "mask", mask, torch.bool)
+        _check_shape("mask", mask, shape)
     for name, field in fields.items():
-        if tuple(field.shape[-2:]) != shape or field.numel() != math.prod(shape) or min(shape) < 2:
-            raise ValueError(f"{name}: shape {tuple(field.shape)} given, (1, 1, {shape[0]}, {shape[1]}) is needed")
+        _check_shape(name, field, shape)
         planes[name] = field.detach().cpu().double().reshape(shape).numpy().copy()
         if mask is not None:
             planes[name][~mask.cpu().reshape(shape).numpy()] = np.nan
@@ -282,6 +297,19 @@ def _planes(truth: Tensor | None, heights: Mapping[str, Tensor], mask: Tensor | 
         raise ValueError("heights: no valid pixel to show")
     level = np.nanmean(next(iter(planes.values())))
     return {name: plane - np.nanmean(plane) + level for name, plane in planes.items()}
+
+
+def _check_shape(label: str, field: Tensor, shape: tuple[int, ...]) -> None:
+    """One surface of the shape that the first one has, of at least 2 x 2 pixels."""
+    h, w = shape if len(shape) == 2 and min(shape) > 1 else ("H", "W")
+    if tuple(field.shape) not in ((h, w), (1, h, w), (1, 1, h, w)):
+        raise ValueError(f"{label}: shape {tuple(field.shape)} given, (1, 1, {h}, {w}) is needed")
+
+
+def _check_slopes(label: str, slopes: Tensor, shape: tuple[int, int]) -> None:
+    check_field("compare_heights", label, slopes, 2)
+    if tuple(slopes.shape[-2:]) != shape or slopes.shape[:-3].numel() != 1:
+        raise ValueError(f"{label}: shape {tuple(slopes.shape)} given, (1, 2, {shape[0]}, {shape[1]}) is needed")
 
 
 def _span(plane: _Plane) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_alike, check_field, require
 from torchdls.noise import height_noise, noise_level
 from torchdls.operators import as_pixel_size, dct2, edge_slopes, idct2
 from torchdls.operators.tables import table
@@ -182,6 +183,7 @@ def select(
         Selection(height, choice, risk). The random numbers have a fixed seed: two calls choose alike.
 
     Raises:
+        TypeError: the gradient is not float32 or float64, or the noise of another dtype.
         ValueError: the criterion is unknown, or an argument does not fit.
 
     Source: Stein (1981); Ramani, Blu, Unser (2008); Pang et al., "Recorrupted-to-Recorrupted", CVPR 2021.
@@ -196,6 +198,10 @@ def select(
     """
     if criterion not in ("sure", "r2r"):
         raise ValueError(f"select: criterion={criterion!r} is unknown; choose from 'sure', 'r2r'")
+    check_field("select", "gradient", gradient, 2)
+    if noise is not None:
+        check_alike("select", "noise", noise, gradient.dtype)
+        require(noise.shape == gradient.shape[:1], f"select: noise {tuple(noise.shape)} given, (N,) is needed")
     if gradient.ndim != 4 or candidates < 1:
         raise ValueError(f"select: gradient {tuple(gradient.shape)} and candidates={candidates} given; "
                          "(N, 2, H, W) and at least one candidate are needed")  # fmt: skip

@@ -21,6 +21,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_dtype
+
 Formula = Callable[[Tensor, Tensor], Tensor]
 Size = int | tuple[int, int]
 
@@ -64,8 +66,8 @@ class AnalyticSurface:
         A `Surface`.
 
     Raises:
-        ValueError: `n` is not at least 2, or `dtype` is not float32 or float64.
-        TypeError: `n` is not made of integers.
+        ValueError: `n` is not at least 2.
+        TypeError: `n` is not made of integers, or `dtype` is not float32 or float64.
 
     Attributes:
         name: the name of the surface.
@@ -83,7 +85,7 @@ class AnalyticSurface:
     ) -> Surface:
         """Sample the surface."""
         h, w = _check_size(n)
-        _check_dtype(dtype)
+        check_dtype(self.name, dtype)
         side = max(h, w) - 1
         x, y = _unit_grid(h, w, device)
         z, slopes = _differentiate(self.formula, x, y)
@@ -265,14 +267,15 @@ def terrain(
 
     Raises:
         ImportError: matplotlib is missing; `pip install "torchdls[plots]"` brings it.
-        ValueError: `n`, `smoothing` or `dtype` is out of range.
+        ValueError: `n` or `smoothing` is out of range.
+        TypeError: `n` is not made of integers, or `dtype` is not float32 or float64.
 
     Example:
         >>> torchdls.terrain((48, 64)).height.shape
         torch.Size([1, 1, 48, 64])
     """
     h, w = _check_size(n)
-    _check_dtype(dtype)
+    check_dtype("terrain", dtype)
     if not 0 <= smoothing < math.inf:
         raise ValueError(f"smoothing: {smoothing} given, a finite number of at least 0 is needed")
     import numpy as np
@@ -300,11 +303,6 @@ def _check_size(n: Size) -> tuple[int, int]:
     if min(pair) < 2:
         raise ValueError(f"n: {n!r} given, at least 2 pixels a side are needed")
     return pair[0], pair[1]
-
-
-def _check_dtype(dtype: torch.dtype) -> None:
-    if dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"dtype: {dtype} given, torch.float32 or torch.float64 is needed")
 
 
 def _unit_grid(h: int, w: int, device: torch.device | str | None) -> tuple[Tensor, Tensor]:

@@ -50,6 +50,12 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def made_by(module: str) -> str:
+    """The line under a table or a picture: what made it, and the commit that this run started from."""
+    changed = ", with changes that were not committed" if AT_START["uncommitted_changes"] else ""
+    return f"Made by `python -m {module}` at {AT_START['commit']}{changed}.\n"
+
+
 def replace_section(path: Path | str, name: str, text: str) -> None:
     """Put text between the lines `<!-- name -->` and `<!-- /name -->` of a Markdown file."""
     path, start, end = Path(path), f"<!-- {name} -->", f"<!-- /{name} -->"
@@ -70,7 +76,7 @@ def _version(name: str) -> str | None:
 
 
 def _git(*args: str) -> str:
-    run = subprocess.run(["git", *args], cwd=ROOT, capture_output=True, text=True, check=False)
+    run = subprocess.run(["git", *args], cwd=ROOT.parent, capture_output=True, text=True, check=False)
     return run.stdout.strip()
 
 

@@ -2,8 +2,8 @@
 
 Tent and Vase at 200 x 200 under white noise, several draws each: least squares, DLS with its default parameters, and
 DLS with the best fixed threshold of a sweep, beside the columns of the paper. `--trials` measures single changes to
-the algorithm. All noise draws of a surface run as one batch. Writes JSON and a Markdown table; the README quotes the
-table.
+the algorithm. All noise draws of a surface run as one batch. Writes JSON and a Markdown table; docs/results.md quotes
+the table.
 """
 
 from __future__ import annotations

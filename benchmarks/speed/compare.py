@@ -2,7 +2,7 @@
 
 In every case the candidates take turns in one process (A B A B ..); the ratio of the medians is what travels to other
 machines. Floors (a product with the dictionary, an FFT and its inverse, a copy) stand beside them, and each candidate's
-peak memory is that of a process of its own. Writes JSON and Markdown, and the table of the README.
+peak memory is that of a process of its own. Writes JSON and Markdown, and the table of docs/results.md.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from benchmarks.common.peers import (
     sparse_cg,
     sparse_direct,
 )
-from benchmarks.common.report import markdown_table, replace_section, results_folder, write_json
+from benchmarks.common.report import made_by, markdown_table, replace_section, results_folder, write_json
 from benchmarks.common.timing import fresh_process, interleaved, peak_megabytes, statistics
 from torchdls import (
     DLS,
@@ -277,7 +277,7 @@ def milliseconds(x: float) -> str:
 
 
 def summary(results: dict[str, Any]) -> str:
-    """The table of the README: ours beside what it is held against."""
+    """The table of docs/results.md: ours beside what it is held against."""
     header = ("task", "torchdls, ms", "beside it", "ms", "ratio", "target")
     lines = []
     for r in results.values():
@@ -330,13 +330,14 @@ def main() -> None:
     folder: Path = results_folder(args.smoke)
     write_json(folder / "compare.json", threads=args.threads, results=results, error_against_time=curve)
     header = ("task", "candidate", "median ms", "quartiles ms", "peak MB", "ratio", "against")
-    text = summary(results) + (f"\n{CURVE}\n\n{curve_table(curve)}" if curve else "")
+    made = f"\n{made_by('benchmarks.speed.compare')}"
+    text = summary(results) + made + (f"\n{CURVE}\n\n{curve_table(curve)}{made}" if curve else "")
     (folder / "compare.md").write_text(f"{text}\n{markdown_table(header, rows(results))}")
     print(text)
     print(f"wrote {folder / 'compare.md'}")
     if whole and not args.smoke:
         about = f"Medians of runs in turns, {args.threads} threads; a ratio below 1 means that torchdls is faster."
-        replace_section(Path(__file__).resolve().parents[2] / "README.md", "speed", f"{about}\n\n{text}")
+        replace_section(Path(__file__).resolve().parents[2] / "docs" / "results.md", "speed", f"{about}\n\n{text}")
 
 
 if __name__ == "__main__":

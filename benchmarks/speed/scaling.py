@@ -1,7 +1,7 @@
 """How time and memory grow: `python -m benchmarks.speed.scaling` (some minutes; add --smoke, or --largest 1024).
 
 Each point is a process of its own, so that its peak memory is its own. Prints the fitted exponent of time in pixels
-(from 128^2 to 2048^2), draws docs/scaling.png and says so in the README.
+(from 128^2 to 2048^2), draws docs/scaling.png and says so in docs/results.md.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.common.report import replace_section, results_folder, write_json
+from benchmarks.common.report import made_by, replace_section, results_folder, write_json
 from benchmarks.common.timing import fresh_process, peak_megabytes
 from torchdls import DLS, add_noise
 from torchdls.surfaces import SURFACES
@@ -119,16 +119,17 @@ def main() -> None:
     root = Path(__file__).resolve().parents[2]
     draw(curves, folder / "scaling.png" if args.smoke else root / "docs" / "scaling.png")
     if not args.smoke:
-        replace_section(root / "README.md", "scaling", summary(curves["pixels, 2 threads"], slopes))
+        replace_section(root / "docs" / "results.md", "scaling", summary(curves["pixels, 2 threads"], slopes))
 
 
 def summary(points: list[dict[str, Any]], slopes: dict[str, float]) -> str:
-    """What the README says of it."""
+    """What docs/results.md says of it."""
     largest = points[-1]
     share = largest["megabytes"] / largest["codes_megabytes"]
     growth = " and ".join(f"pixels^{slope:.2f} ({name.split(', ')[1]})" for name, slope in slopes.items())
     return (
-        f"![Time and memory of DLS](docs/scaling.png)\n\nAn iteration takes time in proportion to {growth}. At "
+        f"![Time and memory of DLS](docs/scaling.png)\n\n{made_by('benchmarks.speed.scaling')}\n"
+        f"An iteration takes time in proportion to {growth}. At "
         f"{largest['size']} x {largest['size']} it takes {largest['seconds']:.1f} s, and the whole run "
         f"{largest['megabytes'] / 1024:.1f} GB: {share:.1f} times the codes."
     )

@@ -11,6 +11,7 @@ from PIL import Image
 
 from torchdls import LeastSquares, gradient_to_normals, io, normals_to_gradient, rmse
 from torchdls.cli.main import main
+from torchdls.geometry import GRADIENT_CONVENTIONS, NORMAL_CONVENTIONS
 from torchdls.surfaces import SURFACES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -99,7 +100,7 @@ def test_gradient_by_least_squares(tmp_path, gradient_file, capsys):
     assert "least_squares: 32 x 32 pixels" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("convention", ["opengl", "directx", "opencv", "kornia", "matlab"])
+@pytest.mark.parametrize("convention", NORMAL_CONVENTIONS)
 @pytest.mark.parametrize("bits", [8, 16])
 def test_normal_maps_in_every_convention(tmp_path, convention, bits):
     s, out = surface(), tmp_path / "z.npy"
@@ -112,10 +113,13 @@ def test_normal_maps_in_every_convention(tmp_path, convention, bits):
     assert error < {8: 0.05, 16: 0.0002}[bits] * (1 + steep) ** 2
 
 
-@pytest.mark.parametrize("convention, signs", [("image", (1, 1)), ("cartesian", (1, -1)), ("depth", (-1, -1))])
-def test_gradient_conventions(tmp_path, convention, signs):
-    g = surface().gradient[0].numpy() * np.array(signs)[:, None, None]
-    np.save(tmp_path / "g.npy", g)
+@pytest.mark.parametrize("convention", GRADIENT_CONVENTIONS)
+def test_gradient_conventions(tmp_path, convention):
+    g = surface().gradient[0].numpy()
+    stored = np.empty_like(g)
+    for component, (index, sign) in zip(g, GRADIENT_CONVENTIONS[convention], strict=True):
+        stored[index] = sign * component
+    np.save(tmp_path / "g.npy", stored)
     arguments = ["integrate", str(tmp_path / "g.npy"), "--convention", convention, "--method", "least_squares"]
     assert main([*arguments, "--quiet", "-o", str(tmp_path / "z.npy")]) == 0
     torch.testing.assert_close(io.load_height(tmp_path / "z.npy").height, LeastSquares()(surface().gradient))

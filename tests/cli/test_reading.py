@@ -1,16 +1,26 @@
 """How a normal map is taken: its convention, what faces away, what is background, and what is said of it."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from torchdls import LeastSquares, gradient_to_normals, guess_convention, io
+from torchdls import LeastSquares, gradient_to_normals, guess_convention, io, normals_to_gradient
 from torchdls.cli.main import main
-from torchdls.geometry import NORMAL_CONVENTIONS, convert_normals
+from torchdls.geometry import GRADIENT_CONVENTIONS, NORMAL_CONVENTIONS, convert_gradient, convert_normals
 from torchdls.surfaces import SURFACES
 
-FRONT = ["opengl", "directx", "kornia", "matlab"]
+FRONT = [name for name, axes in NORMAL_CONVENTIONS.items() if axes[2] == (2, 1)]  # their normals face the viewer
+
+
+def first_alike(name):
+    """The first convention that reads the same normals as this one, or as its mirror image in depth: no curl tells."""
+    axes = NORMAL_CONVENTIONS[name][:2]
+    mirror = tuple((index, -sign) for index, sign in axes)
+    return next(other for other in FRONT if NORMAL_CONVENTIONS[other][:2] in (axes, mirror))
 
 
 def terrain():
@@ -46,7 +56,7 @@ def test_auto_takes_the_reading_that_is_a_surface(tmp_path, capsys, true, noise)
     # The sign of the height cannot be told from its normals: directx and kornia are mirror images in depth.
     error = min(float((sign * height - exact).std()) for sign in (1, -1))
     assert error < (0.25 if noise else 1e-5) * float(exact.std())
-    assert "convention " + {"kornia": "directx"}.get(true, true) in said.out
+    assert f"convention {first_alike(true)}" in said.out
 
 
 def test_auto_takes_normals_that_point_into_the_picture(tmp_path, capsys):
@@ -61,13 +71,12 @@ def test_auto_takes_normals_that_point_into_the_picture(tmp_path, capsys):
 def test_a_wrong_reading_is_one_line_of_warning_that_names_the_right_one(tmp_path, capsys, true, read):
     path = write(tmp_path / "n.png", gradient_to_normals(terrain().gradient, true))
     lines = run(capsys, path, "--convention", read, "--quiet").err.splitlines()
-    same = {"kornia": "directx"}
-    if same.get(true, true) == same.get(read, read):  # equally integrable
+    if first_alike(true) == first_alike(read):  # equally integrable
         assert lines == []
         return
     assert len(lines) == 1
-    assert lines[0].startswith(f"torchdls: warning: {path}: under convention {same.get(true, true)!r} the normals are ")
-    assert f"--convention {same.get(true, true)} or auto" in lines[0]
+    assert lines[0].startswith(f"torchdls: warning: {path}: under convention {first_alike(true)!r} the normals are ")
+    assert f"--convention {first_alike(true)} or auto" in lines[0]
 
 
 @pytest.mark.parametrize("name", ["sphere", "bowl", "saddle", "plane", "noise", "ridge"])
@@ -104,7 +113,7 @@ def test_normals_that_face_away_are_an_error_that_names_the_way_out(tmp_path, ca
     message = run(capsys, path, "--convention", as_read, status=2).err
     assert message.count("\n") == 1
     assert f"100% of the normals face away from the viewer under convention '{as_read}'" in message
-    facing = "opencv" if holds == "opencv" else "opengl and directx and kornia and matlab"
+    facing = "opencv" if holds == "opencv" else " and ".join(FRONT)
     assert f"they face it under {facing}: --convention {holds}" in message
 
 
@@ -152,6 +161,50 @@ def test_what_is_read_is_said_and_can_be_said(tmp_path, capsys):
     message = run(capsys, tmp_path / "noise.png", status=2).err
     assert "the vectors have length 1 in none of the packings" in message
     assert "--channels" in message
+
+
+def test_a_new_convention_is_one_entry_of_the_table(tmp_path, capsys, monkeypatch):
+    """What reads, writes, guesses, lists and refuses finds it there, and only there."""
+    normals = gradient_to_normals(terrain().gradient)
+    turned = torch.stack([-normals[:, 1], -normals[:, 0], normals[:, 2]], 1)  # x down the rows, y to the left
+    with monkeypatch.context() as patch:
+        patch.setitem(NORMAL_CONVENTIONS, "turned", ((1, -1), (0, -1), (2, 1)))
+        torch.testing.assert_close(normals_to_gradient(turned, "turned").gradient, terrain().gradient)
+        torch.testing.assert_close(gradient_to_normals(terrain().gradient, "turned"), turned)
+        torch.testing.assert_close(convert_normals(turned, "turned", "opengl"), normals)
+        assert guess_convention(turned, candidates=list(NORMAL_CONVENTIONS)).convention == "turned"
+        path = write(tmp_path / "n.npy", turned)
+        assert "convention turned" in run(capsys, path, "--convention", "auto").out
+        assert "convention turned" in run(capsys, path, "--convention", "turned").out
+        assert "turned" in run(capsys, path, "--convention", "none", status=2).err
+        assert ", turned, or auto" in help_of_integrate(capsys)
+    assert "turned" not in run(capsys, path, "--convention", "none", status=2).err
+    with pytest.raises(ValueError, match="'turned' is unknown; choose from opengl"):
+        normals_to_gradient(turned, "turned")
+
+
+def test_a_new_gradient_convention_is_one_entry_of_the_table(tmp_path, capsys, monkeypatch):
+    gradient, path = terrain().gradient, tmp_path / "g.npy"
+    np.save(path, -gradient[0].flip(0).numpy())
+    monkeypatch.setitem(GRADIENT_CONVENTIONS, "turned", ((1, -1), (0, -1)))
+    run(capsys, path, "--convention", "turned")
+    torch.testing.assert_close(io.load_height(tmp_path / "z.npy").height, LeastSquares()(gradient))
+    torch.testing.assert_close(convert_gradient(-gradient.flip(1), "turned"), gradient)
+    assert "turned; by default" in help_of_integrate(capsys)
+
+
+def help_of_integrate(capsys):
+    with pytest.raises(SystemExit):
+        main(["integrate", "--help"])
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_the_help_names_all_conventions_without_loading_torch():
+    code = "import sys; from torchdls.cli.main import main\ntry: main(['integrate', '--help'])\n"
+    code += "finally: print('torch' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False).stdout
+    assert found.rstrip().endswith("False")
+    assert all(name in found for name in (*NORMAL_CONVENTIONS, *GRADIENT_CONVENTIONS))
 
 
 def test_every_convention_is_tried():

@@ -174,6 +174,19 @@ def test_float32_keeps_up_with_float64():
         torch.testing.assert_close(costs[1], costs[0], rtol=1e-3, atol=0)
 
 
+@pytest.mark.parametrize("order", ["atom", "block"])
+def test_the_layout_of_the_patches_makes_no_difference(order):
+    """`unfold` puts the pixels of a patch far apart; the sweep works on a residual that has them side by side."""
+    height = LeastSquares()(SURFACES["peaks"](40).gradient)
+    apart = torch.nn.functional.unfold(height, 8, stride=2)
+    together = Patches(8, 2).extract(height)
+    assert torch.equal(apart, together)
+    assert apart.stride() != together.stride()
+    D, B = dct_dictionary(8)[None], torch.zeros(1, 64, apart.shape[-1])
+    for one, other in zip(*(soup_dil_sweep(P, D, B, 0.1, order=order) for P in (apart, together)), strict=True):
+        assert torch.equal(one, other)
+
+
 def test_arguments_are_left_alone():
     P, D, B = problem()
     mu = torch.full((9,), 0.5, dtype=P.dtype)

@@ -1,16 +1,25 @@
-"""`vmap(grad)` of every integrator and photometric method, in every input, equals a loop of gradients."""
+"""`vmap(grad)` of every integrator and photometric method equals a loop of gradients; so does `vmap(jvp)` of these."""
+
+from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
-from torch.func import grad, vmap
+from torch.func import grad, jvp, vmap
 
 from tests.helpers import random_field, uniform_field
 from tests.helpers.methods import bumps, method, promising
-from torchdls import INTEGRATORS, low_rank_normals, ring_of_lights, sparse_normals, woodham
+from torchdls import INTEGRATORS, PhotometricResult, low_rank_normals, ring_of_lights, sparse_normals, woodham
 
 pytestmark = pytest.mark.device
 PLACES = 2
-ITERATIVE = [pytest.param(f, marks=pytest.mark.slow) for f in (sparse_normals, low_rank_normals)]
+# A few iterations: what is mapped is each of them alike.
+PHOTOMETRIC: dict[str, Callable[..., PhotometricResult]] = {
+    "woodham": woodham,
+    "sparse_normals, bayes": partial(sparse_normals, n_iter=5),
+    "sparse_normals, l1": partial(sparse_normals, prior="l1", n_iter=5),
+    "low_rank_normals": partial(low_rank_normals, max_iter=5),
+}
 
 
 def per_sample(f, *tensors):
@@ -37,10 +46,34 @@ def test_integrators(name, argument):
     assert one_by_one.any()
 
 
-@pytest.mark.parametrize("normals", [woodham, *ITERATIVE])
-def test_photometric_methods(normals):
+@pytest.mark.parametrize("argument", ["images", "lights"])
+@pytest.mark.parametrize("name", PHOTOMETRIC)
+def test_photometric_methods(name, argument):
+    """vmap(grad) and vmap(jvp) equal their loops, and the one is the transpose of the other."""
     lights = ring_of_lights(8, 45, dtype=torch.float64, device=torch.get_default_device())
-    images = 0.2 + uniform_field(PLACES, 8, 5, 4, seed=4)
-    together, one_by_one = per_sample(lambda i: normals(i, lights).normals[0].sum(), images)
-    torch.testing.assert_close(together, one_by_one, rtol=1e-6, atol=1e-8)
-    assert one_by_one.any()
+    given = {
+        "images": 0.2 + uniform_field(PLACES, 8, 5, 4, seed=4),
+        "lights": lights + 0.1 * random_field(PLACES, 8, 3, seed=5),
+    }
+    mask = uniform_field(1, 5, 4, seed=8) < 0.8  # of a single surface, the same for all
+    probe, change = random_field(5, 5, 4, seed=6), random_field(*given[argument].shape, seed=7)
+
+    def results(images, lights):
+        return torch.cat(PHOTOMETRIC[name](images, lights, mask=mask))
+
+    def forward(images, lights, change):
+        def of(x):
+            return results(**{"images": images, "lights": lights} | {argument: x})
+
+        return jvp(of, ({"images": images, "lights": lights}[argument],), (change,))[1]
+
+    inputs = given["images"], given["lights"]
+    slope = grad(lambda i, k: (probe * results(i, k)).sum(), argnums=int(argument == "lights"))
+    slopes, changes = vmap(slope)(*inputs), vmap(forward)(*inputs, change)
+    singles = [tuple(t[i] for t in (*inputs, change)) for i in range(PLACES)]
+    close = {"rtol": 1e-6, "atol": 1e-8}
+    torch.testing.assert_close(slopes, torch.stack([slope(i, k) for i, k, _ in singles]), **close)
+    torch.testing.assert_close(changes, torch.stack([forward(*single) for single in singles]), **close)
+    along = (slopes * change).flatten(1).sum(1)
+    torch.testing.assert_close(along, (probe * changes).flatten(1).sum(1), **close)
+    assert along.all()

@@ -33,7 +33,7 @@ def test_directions_are_found_to_a_degree(tilt):
     (torch.ones(2, 20, 20), torch.ones(20, 20, dtype=torch.bool), ValueError, "image 0 of 2 shows no highlight"),
     (torch.ones(2, 20, 20), torch.zeros(20, 20, dtype=torch.bool), ValueError, "0 pixels"),
     (torch.ones(2, 20, 20), torch.ones(19, 20, dtype=torch.bool), ValueError, r"\(2, 20, 20\) and ball \(19, 20\)"),
-    (torch.ones(2, 20, 20), torch.ones(20, 20), TypeError, "ball is torch.float32"),
+    (torch.ones(2, 20, 20), torch.ones(20, 20), TypeError, "ball has dtype torch.float32"),
     (torch.ones(2, 20, 20).int(), torch.ones(20, 20, dtype=torch.bool), TypeError, "images"),
 ])  # fmt: skip
 def test_bad_input_is_named(images, mask, error, message):

@@ -270,6 +270,24 @@ def test_vmap_and_jacobians_equal_a_loop():
     torch.testing.assert_close(torch.func.jacrev(height)(g[0]), torch.func.jacfwd(height)(g[0]))
 
 
+@pytest.mark.parametrize("taped", [False, True])
+@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("shape", [*SHAPES, (128, 3), (129, 5), (4, 130), (131, 140)], ids=str)
+def test_full_rectangles_by_products_and_by_transforms(shape, n, taped):
+    """One surface and several, small and large, recorded or not: each takes another way to the same minimiser."""
+    g = random_field(n, 2, *shape)
+    with assert_unchanged(g):
+        z = integrate_direct(g.requires_grad_(taped), (0.5, 3.0)).detach()
+    assert z.shape == (n, 1, *shape)
+    assert_solves(z, edge_slopes(g.detach())[0], None, pixel_size=(0.5, 3.0), atol=1e-10)
+    assert z.mean((1, 2, 3)).abs().max() < 1e-12 * (1 + z.abs().max())
+    if taped:
+        probe = random_field(n, 1, *shape, seed=1)
+        (slope,) = torch.autograd.grad((integrate_direct(g, (0.5, 3.0)) * probe).sum(), g)
+        change = random_field(n, 2, *shape, seed=2)
+        torch.testing.assert_close((slope * change).sum(), (probe * integrate_direct(change, (0.5, 3.0))).sum())
+
+
 def test_solve_direct_inverts_the_shifted_laplacian():
     b = random_field(2, 1, 6, 5)
     H, _ = normal_equations(

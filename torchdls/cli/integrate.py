@@ -9,9 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchdls._conventions import GRADIENT_CONVENTIONS, NORMAL_CONVENTIONS
 from torchdls._registry import INTEGRATORS
 from torchdls.cli.methods import build_method, check_method, run_method
-from torchdls.cli.reading import Reading, read_normals
+from torchdls.cli.reading import AUTO, Reading, read_normals
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -39,8 +40,8 @@ def add_integrate(commands: Any) -> None:
     add("--mask", metavar="FILE", help="image or array; white or nonzero is valid")
     add("--channels", metavar="PACKING", help="how the normals are packed, if it is not found right: rgb, rgz, rg, ag "
         "(x in alpha) or xyz (signed); with an a at the end, as in rgba, alpha is the mask")  # fmt: skip
-    add("--convention", help="normals: opengl (default), directx, opencv, kornia, matlab, or auto (the most "
-        "integrable); gradients: image (default: right, down), cartesian (right, up), depth, matlab")  # fmt: skip
+    add("--convention", help=f"normals: {', '.join(NORMAL_CONVENTIONS)}, or {AUTO} (the most integrable); "
+        f"gradients: {', '.join(GRADIENT_CONVENTIONS)}; by default the first of each")  # fmt: skip
     add("--pixel-size", type=float, nargs="+", metavar="D", help="spacing of the pixels, or of columns and rows")
     add("--camera", metavar="K", help="intrinsics, 3 x 3 in NPY, NPZ or text, or FX,FY,CX,CY in pixels: undo the "
         "perspective; files then hold the depth, with geometric mean 1, and meshes the points")  # fmt: skip
@@ -133,7 +134,7 @@ def _joint_mask(arguments: argparse.Namespace, field: Field) -> Tensor | None:
 
 def _gradient(arguments: argparse.Namespace, field: Field, camera: Tensor | None) -> Reading:
     """Gradient in the library's convention, and the mask of its valid pixels."""
-    from torchdls.geometry import GRADIENT_CONVENTIONS, convert_gradient
+    from torchdls.geometry import convert_gradient
 
     if field.kind == "normals":
         return read_normals(arguments.input, field, arguments.convention, camera)

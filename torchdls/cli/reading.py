@@ -5,6 +5,8 @@ from __future__ import annotations
 import random
 from typing import TYPE_CHECKING, NamedTuple
 
+from torchdls._conventions import NORMAL_CONVENTIONS
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -25,12 +27,12 @@ class Reading(NamedTuple):
 
 
 def read_normals(path: str, field: Field, asked: str | None, camera: Tensor | None = None) -> Reading:
-    """Slopes of a normal map, under the convention asked for (default: opengl) or the best (`auto`).
+    """Slopes of a normal map, under the convention asked for (default: the first of the table) or the best (`auto`).
 
     Raises:
         ValueError: the convention is unknown, no pixel holds a normal, or most normals face away from the viewer.
     """
-    from torchdls.geometry import NORMAL_CONVENTIONS, normals_to_gradient
+    from torchdls.geometry import normals_to_gradient
 
     known = list(NORMAL_CONVENTIONS)
     if asked not in (None, AUTO, *known):

@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_dtype
+
 
 def dct_dictionary(
     patch_size: int | tuple[int, int] = 8,
@@ -32,6 +34,7 @@ def dct_dictionary(
         (n, K), atoms flattened row by row; atom 0 is the constant.
 
     Raises:
+        TypeError: the dtype is not float32 or float64.
         ValueError: a size or the number of atoms is not positive.
 
     Example:
@@ -41,6 +44,7 @@ def dct_dictionary(
         >>> torch.allclose(D.T @ D, torch.eye(64), atol=1e-5)
         True
     """
+    check_dtype("dct_dictionary", dtype)
     sides = (patch_size, patch_size) if isinstance(patch_size, int) else patch_size
     if not isinstance(sides, tuple) or len(sides) != 2 or not all(isinstance(c, int) and c > 0 for c in sides):
         raise ValueError(f"patch_size: {patch_size!r} given, a positive integer or a pair (rows, columns) is needed")

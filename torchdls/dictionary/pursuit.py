@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
+
+from torchdls._checks import check_alike, check_real
 
 _CHUNK = 8192  # patches worked on at once: their rows of the Gram matrix are gathered
 
@@ -25,6 +29,7 @@ def orthogonal_matching_pursuit(
         tol: squared residual that suffices: a number or a tensor that broadcasts to (N, L).
 
     Raises:
+        TypeError: P is not float32 or float64, D of another dtype, or a tensor `mu` or `tol` not of floats.
         ValueError: shapes do not fit, or `n_nonzero` is not an integer of at least 1.
 
     Source: Pati, Rezaiifar, Krishnaprasad, "Orthogonal matching pursuit", 1993; Rubinstein, Zibulevsky, Elad,
@@ -35,12 +40,22 @@ def orthogonal_matching_pursuit(
         >>> torchdls.orthogonal_matching_pursuit(torch.tensor([[[0.1], [2.0], [1.0]]]), D, n_nonzero=1)[0, :, 0]
         tensor([0., 2., 0.])
     """
+    check_real("orthogonal_matching_pursuit", "P", P)
+    check_alike("orthogonal_matching_pursuit", "D", D, P.dtype)
     if P.ndim != 3 or D.ndim != 3 or D.shape[0] not in (1, P.shape[0]) or D.shape[1] != P.shape[1]:
         shapes = f"P {tuple(P.shape)} and D {tuple(D.shape)} do not fit"
         raise ValueError(f"orthogonal_matching_pursuit: {shapes}; (N, n, L) and (N or 1, n, K) are needed")
     if n_nonzero is not None and (not isinstance(n_nonzero, int) or n_nonzero < 1):
         raise ValueError(f"n_nonzero: {n_nonzero!r} given, an integer of at least 1 is needed")
     N, n, L = P.shape
+    for label, level in (("mu", mu), ("tol", tol)):
+        if not isinstance(level, Tensor):
+            continue
+        check_real("orthogonal_matching_pursuit", label, level)
+        if not _broadcasts(level.shape, (N, L)):
+            raise ValueError(
+                f"orthogonal_matching_pursuit: {label} {tuple(level.shape)} given, it must broadcast to ({N}, {L})"
+            )
     limit = min(n, D.shape[-1], n if n_nonzero is None else n_nonzero)
     least, enough = (torch.as_tensor(t, dtype=P.dtype, device=P.device).expand(N, L) for t in (mu, tol))
     codes = []
@@ -49,6 +64,11 @@ def orthogonal_matching_pursuit(
         columns = zip(P[i].split(_CHUNK, -1), least[i].split(_CHUNK), enough[i].split(_CHUNK), strict=True)
         codes.append(torch.cat([_pursue(p, d, limit, m, t) for p, m, t in columns], 0).mT)
     return torch.stack(codes)
+
+
+def _broadcasts(shape: Sequence[int], to: tuple[int, ...]) -> bool:
+    wanted = to[len(to) - len(shape) :]
+    return len(shape) <= len(to) and all(a in (1, b) for a, b in zip(shape, wanted, strict=True))
 
 
 def _pursue(P: Tensor, D: Tensor, limit: int, least: Tensor, enough: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls._checks import check_alike, check_real
 from torchdls._tracing import is_recorded
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold, shrink
 
@@ -67,6 +68,7 @@ def soup_dil_sweep(
         D and B after the sweep; the arguments are not written to.
 
     Raises:
+        TypeError: P is not float32 or float64, D or B of another dtype, or a tensor mu not of floats.
         ValueError: shapes do not fit, an option is unknown, the bound is not positive, or a number mu is negative.
 
     Source: Ravishankar, Nadakuditi, Fessler, "Efficient sum of outer products dictionary learning (SOUP-DIL)", 2015.
@@ -80,7 +82,8 @@ def soup_dil_sweep(
     """
     _check(P, D, B, order, unused, threshold)
     _check_levels(mu, bound, B)
-    R = (P.mT - B.mT @ D.mT).mT
+    # Each patch contiguous in memory, whatever the layout of P (`unfold` puts its pixels far apart).
+    R = torch.baddbmm(P.mT, B.mT, D.mT.expand(P.shape[0], -1, -1), alpha=-1).mT
     B = B if is_recorded(R, D, B) else B.clone()
     _, D, B = residual_sweep(R, D, B, mu, bound, order, unused=unused, learn=learn, threshold=threshold)
     return D, B
@@ -291,6 +294,7 @@ def _check_levels(mu: float | Tensor, bound: float, B: Tensor) -> None:
         raise ValueError(f"bound: {bound!r} given, a positive number is needed")
     N, K, _ = B.shape
     if isinstance(mu, Tensor):
+        check_real("soup_dil_sweep", "mu", mu)
         rows, columns = mu.shape if mu.ndim == 2 else (1, mu.numel())
         if mu.ndim > 2 or rows not in (1, N) or columns not in (1, K):
             raise ValueError(f"mu: {tuple(mu.shape)} given, it must broadcast to (N, K) = ({N}, {K})")
@@ -305,6 +309,9 @@ def _check(P: Tensor, D: Tensor, B: Tensor, order: str, unused: str, threshold: 
         raise ValueError(f"unused: {unused!r} is unknown; choose 'first' or 'keep'")
     if threshold not in THRESHOLDS:
         raise ValueError(f"threshold: {threshold!r} is unknown; choose from {', '.join(map(repr, THRESHOLDS))}")
+    check_real("soup_dil_sweep", "P", P)
+    check_alike("soup_dil_sweep", "D", D, P.dtype)
+    check_alike("soup_dil_sweep", "B", B, P.dtype)
     fits = P.ndim == D.ndim == B.ndim == 3 and D.shape[0] in (1, P.shape[0])
     if not fits or D.shape[1] != P.shape[1] or B.shape != (P.shape[0], D.shape[2], P.shape[2]):
         raise ValueError(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchdls._checks import check_field
+from torchdls._checks import check_field, check_real
 from torchdls.geometry.conventions import NORMAL_CONVENTIONS, permute
 from torchdls.operators import as_pixel_size
 
@@ -18,11 +18,16 @@ def log_depth_to_depth(log_depth: Tensor, scale: float | Tensor = 1.0) -> Tensor
     An integrator returns u with zero mean, so `scale` is the geometric mean of the depth (of each component of the
     mask), in the unit wanted; a tensor must broadcast against (N, 1, H, W).
 
+    TypeError for a log depth or a scale that is not float32 or float64.
+
     Example:
         >>> torchdls.log_depth_to_depth(torch.zeros(1, 1, 2, 2), scale=3.0)
         tensor([[[[3., 3.],
                   [3., 3.]]]])
     """
+    check_real("log_depth_to_depth", "log_depth", log_depth)
+    if isinstance(scale, Tensor):
+        check_real("log_depth_to_depth", "scale", scale)
     return scale * log_depth.exp()
 
 
@@ -71,9 +76,7 @@ def pixel_grid(like: Tensor) -> Tensor:
 
 def check_camera(camera: Tensor, field: Tensor) -> Tensor:
     """The camera (N, 3, 3) in the dtype of the field, once it is found to fit."""
-    if not isinstance(camera, Tensor) or not camera.is_floating_point():
-        got = getattr(camera, "dtype", type(camera).__name__)
-        raise TypeError(f"camera: {got} given, a floating-point tensor is needed")
+    check_real("camera", "K", camera)
     allowed = [(3, 3)] if field.ndim == 3 else [(3, 3), (1, 3, 3), (field.shape[0], 3, 3)]
     if camera.shape not in allowed:
         shapes = f"{tuple(camera.shape)} given beside {tuple(field.shape)}"

@@ -1,4 +1,4 @@
-"""The conventions that users meet, and the way between them and the canonical one."""
+"""The way between the conventions that users meet (`torchdls._conventions`) and the canonical one."""
 
 from __future__ import annotations
 
@@ -6,26 +6,9 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_field
-
-# Canonical component k is sign * source[index], (index, sign) = table[name][k]: frames are signed permutations.
-Axes = tuple[tuple[int, int], ...]
-
-
-NORMAL_CONVENTIONS: dict[str, Axes] = {
-    "opengl": ((0, 1), (1, 1), (2, 1)),
-    "directx": ((0, 1), (1, -1), (2, 1)),
-    "opencv": ((0, 1), (1, -1), (2, -1)),
-    "kornia": ((0, -1), (1, 1), (2, 1)),
-    "matlab": ((1, 1), (0, -1), (2, 1)),
-}
-
-
-GRADIENT_CONVENTIONS: dict[str, Axes] = {
-    "image": ((0, 1), (1, 1)),
-    "cartesian": ((0, 1), (1, -1)),
-    "depth": ((0, -1), (1, -1)),
-    "matlab": ((1, 1), (0, 1)),
-}
+from torchdls._conventions import GRADIENT_CONVENTIONS as GRADIENT_CONVENTIONS
+from torchdls._conventions import NORMAL_CONVENTIONS as NORMAL_CONVENTIONS
+from torchdls._conventions import Axes as Axes
 
 
 def convert_normals(normals: Tensor, source: str = "opengl", target: str = "opengl") -> Tensor:

@@ -6,20 +6,7 @@ the viewer. The tangents (1, 0, z_x) and (0, -1, z_y) are orthogonal to the norm
 
     z_x = -n1/n3,    z_y = +n2/n3,        n = (-z_x, z_y, 1) / sqrt(1 + z_x^2 + z_y^2).
 
-| normals     | frame of the source                              | to canonical    |
-|-------------|--------------------------------------------------|-----------------|
-| `"opengl"`  | x right, y up, z to the viewer (also glTF, Blender, DiLiGenT) | none |
-| `"directx"` | x right, y down, z to the viewer (green channel inverted) | (n1, -n2, n3) |
-| `"opencv"`  | x right, y down, z forward, normals to the camera (n3 < 0) | (n1, -n2, -n3) |
-| `"kornia"`  | the same frame, normals away from the camera (n3 > 0) | (-n1, n2, n3) |
-| `"matlab"`  | x down the rows, y along the columns, z to the viewer | (n2, -n1, n3) |
-
-| gradients     | components                                     | to canonical |
-|---------------|------------------------------------------------|--------------|
-| `"image"`     | height: to the right, down                     | none         |
-| `"cartesian"` | height: to the right, up                       | (p, -q)      |
-| `"depth"`     | depth (distance, grows away): to the right, down | (-p, -q)   |
-| `"matlab"`    | height: down the rows, along the columns       | (q, p)       |
+Other conventions are signed permutations of these components: the tables of `torchdls._conventions` say which.
 
 **Perspective camera.** With intrinsics K and homogeneous pixel m = (column, row, 1), the surface point is
 X = Z K^-1 m. A tangent plane n.X = d reads l.m = d/Z in the image, with the covector l = K^-T n. Differentiating,
@@ -38,7 +25,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchdls._checks import check_field, check_fit
+from torchdls._checks import check_field, check_fit, check_real
 from torchdls.geometry.cameras import apply_matrix, check_camera, inverse_camera, pixel_grid
 from torchdls.geometry.conventions import NORMAL_CONVENTIONS, inverse_axes, lookup, permute
 from torchdls.operators import as_pixel_size
@@ -94,7 +81,7 @@ def normals_to_gradient(
 
     Args:
         normals: (N, 3, H, W) or (3, H, W), of any length.
-        convention: a key of `NORMAL_CONVENTIONS` (table at the top of this module).
+        convention: a key of `NORMAL_CONVENTIONS` (the table of `torchdls._conventions`).
         mask: (N, 1, H, W) bool; pixels outside are not counted as invalid. Default: all pixels.
         camera: intrinsics K, (3, 3) or (N, 3, 3), in pixels, with integer coordinates at pixel centres and the first
             pixel at (0, 0). The result is then the gradient of log depth per pixel; see `log_depth_to_depth`.
@@ -189,6 +176,8 @@ class _Conversion(nn.Module):
     ) -> None:
         super().__init__()
         lookup(NORMAL_CONVENTIONS, "convention", convention)
+        if camera is not None:
+            check_real("camera", "K", camera)
         self.convention, self.pixel_size = convention, _pixel_size(pixel_size, camera)
         if isinstance(camera, nn.Parameter):
             self.register_parameter("camera", camera)
@@ -288,6 +277,7 @@ def guess_convention(
         >>> torchdls.guess_convention(normals).convention
         'directx'
     """
+    check_field("guess_convention", "normals", normals, 3)
     curl, scale = {}, 0.0
     for name in candidates:
         field = normals_to_gradient(normals.detach(), name, mask=mask, camera=camera)

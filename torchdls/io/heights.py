@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_alike, check_real
 from torchdls._files import (
     Array,
     as_array,
@@ -95,6 +96,7 @@ def save_height(
         **arrays: more entries of an NPZ file; other formats leave them out.
 
     Raises:
+        TypeError: the height or the points are no floats, or the mask is not bool.
         ValueError: the suffix is unknown, a shape is wrong, or no pixel (for a mesh: no triangle) is valid.
         OSError: the directory does not exist, the file exists, or writing fails. ImportError: a library is missing.
 
@@ -106,6 +108,9 @@ def save_height(
         b'ply'
     """
     path = check_output(path, overwrite, suffixes=OUTPUT_SUFFIXES)
+    check_real("save_height", "height", height)
+    if mask is not None:
+        check_alike("save_height", "mask", mask, torch.bool)
     values = single_map("height", height)
     valid = np.isfinite(values) if mask is None else single_map("mask", mask).astype(bool)
     if valid.shape != values.shape:

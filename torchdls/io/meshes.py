@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchdls._checks import check_alike, check_real
 from torchdls._files import (
     as_array,
     atomic_file,
@@ -38,6 +40,9 @@ def save_mesh(
     """
     path = check_output(path, overwrite, suffixes=MESH_SUFFIXES)
     trimesh = require("trimesh", "files")
+    check_real("save_mesh", "points", points)
+    if mask is not None:
+        check_alike("save_mesh", "mask", mask, torch.bool)
     grid = as_array(points)
     grid = grid[0] if grid.ndim == 4 and len(grid) == 1 else grid
     if grid.ndim != 3 or len(grid) != 3:

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_alike, check_real
 from torchdls._files import Array, atomic_file, check_output, naming, require, single_map
 from torchdls.io.fields import load_mask
 from torchdls.io.formats import SIGNATURES, read_file
@@ -110,6 +111,7 @@ def save_normals(
         overwrite: replace an existing file.
 
     Raises:
+        TypeError: the normals are no floats, or the mask is not bool.
         ValueError: the suffix or convention is unknown, or a shape is wrong.
         OSError: the directory does not exist, the file exists, or writing fails. ImportError: a library is missing.
 
@@ -125,6 +127,9 @@ def save_normals(
     from torchdls.geometry import convert_normals
 
     path = check_output(path, overwrite, suffixes=NORMAL_SUFFIXES)
+    check_real("save_normals", "normals", normals)
+    if mask is not None:
+        check_alike("save_normals", "mask", mask, torch.bool)
     n = normals if normals.ndim == 4 else normals[None]
     if n.ndim != 4 or n.shape[:2] != (1, 3):
         raise ValueError(f"normals: {tuple(normals.shape)} given, (1, 3, H, W) or (3, H, W) is needed")

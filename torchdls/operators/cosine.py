@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_real, require
 from torchdls.operators.tables import table
 
 # Up to this side two products with the cosine matrix beat the FFT and its reordering passes (measured on a CPU).
@@ -27,6 +28,10 @@ def dct2(x: Tensor) -> Tensor:
     Returns:
         (..., H, W), in the dtype and on the device of `x`.
 
+    Raises:
+        TypeError: `x` is not a tensor of float32 or float64.
+        ValueError: `x` is empty or has fewer than two dimensions.
+
     Source: Makhoul, "A fast cosine transform in one and two dimensions", IEEE TASSP 28(1), 1980.
 
     Example:
@@ -36,6 +41,7 @@ def dct2(x: Tensor) -> Tensor:
         >>> round(float(coefficients.norm()), 3)
         4.0
     """
+    _check("dct2", x)
     h, w = x.shape[-2:]
     if max(h, w) <= MATRIX_LIMIT:
         return cosine_matrix(h, like=x) @ x @ cosine_matrix(w, like=x).mT
@@ -55,11 +61,16 @@ def idct2(x: Tensor) -> Tensor:
     Returns:
         (..., H, W), in the dtype and on the device of `x`.
 
+    Raises:
+        TypeError: as `dct2`.
+        ValueError: as `dct2`.
+
     Example:
         >>> x = torch.eye(5)
         >>> torch.allclose(torchdls.idct2(torchdls.dct2(x)), x, atol=1e-6)
         True
     """
+    _check("idct2", x)
     h, w = x.shape[-2:]
     if max(h, w) <= MATRIX_LIMIT:
         return cosine_matrix(h, like=x).mT @ x @ cosine_matrix(w, like=x)
@@ -72,23 +83,34 @@ def idct2(x: Tensor) -> Tensor:
     return _restored(y)
 
 
-def half_spectrum(x: Tensor) -> Tensor:
+def _check(name: str, x: Tensor) -> None:
+    check_real(name, "x", x)
+    require(x.ndim >= 2 and 0 not in x.shape, f"{name}: x {tuple(x.shape)} given, (..., H, W) is needed")
+
+
+def half_spectrum(x: Tensor) -> tuple[Tensor, Tensor]:
     """U (.., H, W//2 + 1): one FFT that holds the cosine sums C of x, four to a number.
 
         U[k, l] = (C[k, l] - C[H-k, W-l]) - i (C[H-k, l] + C[k, W-l]),     C[H, .] = C[., W] = 0
 
     with C[k, l] = sum_ij x[i, j] cos(pi k (2 i + 1) / 2H) cos(pi l (2 j + 1) / 2W). A linear map that is diagonal in C
     need not unpack it. x (.., H, W) is not written to.
+
+    Returns:
+        U, and memory of the size of x for `from_half_spectrum`: fresh pages cost large images more than arithmetic.
     """
     h, w = x.shape[-2:]
-    return torch.fft.rfft2(_reordered(x)).mul_(_rotation(h, w, like=x))
+    room = _reordered(x)
+    return torch.fft.rfft2(room).mul_(_rotation(h, w, like=x)), room
 
 
-def from_half_spectrum(spectrum: Tensor, size: tuple[int, int]) -> Tensor:
-    """Inverse of `half_spectrum`; overwrites its argument."""
-    h, w = size
-    spectrum.mul_(_rotation_back(h, w, like=spectrum.real))
-    return _restored(torch.fft.irfft2(spectrum, s=size, norm="forward"))  # the rotation holds the scale
+def from_half_spectrum(spectrum: Tensor, room: Tensor, into: Tensor | None = None) -> Tensor:
+    """Inverse of `half_spectrum`; overwrites its arguments, and writes to `into`, contiguous, if it is given."""
+    h, w = room.shape[-2:]
+    spectrum.mul_(_rotation_back(h, w, like=room))  # the rotation holds the scale
+    if torch.compiler.is_compiling():
+        return _restored(torch.fft.irfft2(spectrum, s=(h, w), norm="forward"))
+    return _restored(torch.fft.irfft2(spectrum, s=(h, w), norm="forward", out=room), into)
 
 
 def mirrored(spectrum: Tensor) -> Tensor:
@@ -180,15 +202,19 @@ def _reordered(x: Tensor) -> Tensor:
     return _gathered(x, _order(*x.shape[-2:], like=x))
 
 
-def _restored(y: Tensor) -> Tensor:
+def _restored(y: Tensor, into: Tensor | None = None) -> Tensor:
     """Inverse of `_reordered`."""
-    return _gathered(y, _order_back(*y.shape[-2:], like=y))
+    return _gathered(y, _order_back(*y.shape[-2:], like=y), into)
 
 
-def _gathered(x: Tensor, positions: Tensor) -> Tensor:
+def _gathered(x: Tensor, positions: Tensor, into: Tensor | None = None) -> Tensor:
     """The pixels of every image at these positions; several times faster than strided copies."""
     flat = x.flatten(-2)
-    return flat.gather(-1, positions.expand(flat.shape)).view(x.shape)
+    if flat.numel() == len(positions) and not torch.compiler.is_compiling():  # a single image: faster again
+        out = None if into is None else into.view(-1)
+        return torch.index_select(flat.flatten(), 0, positions, out=out).view(x.shape)
+    out = None if into is None else into.view(flat.shape)
+    return torch.gather(flat, -1, positions.expand(flat.shape), out=out).view(x.shape)
 
 
 def _negate_rows(v: Tensor) -> Tensor:

@@ -9,6 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls._checks import check_field, check_fit
+from torchdls._tracing import is_recorded
+
 
 def edge_slopes(
     gradient: Tensor, mask: Tensor | None = None, weight: Tensor | None = None
@@ -32,6 +35,10 @@ def edge_slopes(
             v[:, 1, i, :] to the edge between rows i and i + 1 (0 in the last row).
         w: (N, 2, H, W) on the same edges, or None where every trust is 1.
 
+    Raises:
+        TypeError: the gradient is not float32 or float64, the weight is of another dtype, or the mask is not bool.
+        ValueError: a shape or device does not fit.
+
     Example:
         >>> slopes, trust = torchdls.edge_slopes(torch.arange(3.0).expand(1, 2, 1, 3))
         >>> slopes[0, 0]  # half way between the pixels; no edge leaves the last column
@@ -39,8 +46,13 @@ def edge_slopes(
         >>> trust is None  # all are trusted alike
         True
     """
+    check_field("edge_slopes", "gradient", gradient, 2)
     if mask is None and weight is None:
         return _pair_sums(gradient) * 0.5, None
+    if mask is not None:
+        check_fit("edge_slopes", "mask", mask, gradient, "gradient", channels=(1,), dtype=torch.bool)
+    if weight is not None:
+        check_fit("edge_slopes", "weight", weight, gradient, "gradient", channels=(1, 2))
     trust = torch.ones_like(gradient) if weight is None else weight.expand_as(gradient)
     if mask is not None:
         gradient, trust = torch.where(mask, gradient, 0), torch.where(mask, trust, 0)
@@ -60,10 +72,30 @@ def slope_divergence(gradient: Tensor, pixel_size: tuple[float, float] = (1.0, 1
 
         (A^T v)_j = (g_{j-1} - g_{j+1}) / 2 dx + (the same along y),     g_{-1} = -g_0,  g_W = -g_{W-1}
     """
+    if not is_recorded(gradient):
+        return _divergence(gradient, pixel_size)
     if torch.compiler.is_compiling():
         (gx, gy), (dx, dy) = gradient.split(1, -3), pixel_size
         return torch.add(_central(gx, -1) * (0.5 / dx), _central(gy, -2), alpha=0.5 / dy)
     return _SlopeDivergence.apply(gradient, pixel_size)
+
+
+def _divergence(gradient: Tensor, pixel_size: tuple[float, float]) -> Tensor:
+    """The map of `slope_divergence` by a few strided differences, where nobody records them."""
+    gx, gy = gradient.unbind(-3)
+    (h, w), aspect = gx.shape[-2:], pixel_size[0] / pixel_size[1]
+    b = torch.empty_like(gx, memory_format=torch.contiguous_format)
+    if w > 1:
+        torch.sub(gx.narrow(-1, 0, w - 2), gx.narrow(-1, 2, w - 2), out=b.narrow(-1, 1, w - 2))
+        torch.add(gx.select(-1, 0), gx.select(-1, 1), out=b.select(-1, 0)).neg_()
+        torch.add(gx.select(-1, w - 2), gx.select(-1, w - 1), out=b.select(-1, w - 1))
+    else:
+        b.zero_()
+    b.narrow(-2, 1, h - 1).add_(gy.narrow(-2, 0, h - 1), alpha=aspect)
+    b.narrow(-2, 0, h - 1).sub_(gy.narrow(-2, 1, h - 1), alpha=aspect)
+    b.select(-2, 0).sub_(gy.select(-2, 0), alpha=aspect)
+    b.select(-2, h - 1).add_(gy.select(-2, h - 1), alpha=aspect)
+    return b.mul_(0.5 / pixel_size[0]).unsqueeze(-3)
 
 
 class _SlopeDivergence(torch.autograd.Function):

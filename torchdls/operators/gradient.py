@@ -11,6 +11,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls._checks import check_field
+
 Kernel = tuple[tuple[float, ...], ...]
 
 _TAPS: dict[str, tuple[float, ...]] = {
@@ -87,11 +89,13 @@ class GradientOperator:
         )
 
     def __call__(self, z: Tensor) -> Tensor:
-        """Slopes (N, 2, H, W) of a height (N, 1, H, W)."""
+        """Slopes (N, 2, H, W) of a height (N, 1, H, W); TypeError or ValueError if it is not one."""
+        check_field("GradientOperator", "z", z, 1)
         return torch.cat([_correlate(z, k, d) for k, d in zip(self.kernels, self.pixel_size, strict=True)], -3)
 
     def adjoint(self, g: Tensor) -> Tensor:
         """Exact transpose: (N, 2, H, W) -> (N, 1, H, W). Slopes that `__call__` leaves absent are not read."""
+        check_field("GradientOperator", "g", g, 2)
         gx, gy = g.split(1, -3)
         (kx, ky), (dx, dy) = self.kernels, self.pixel_size
         return _correlate_transpose(gx, kx, dx) + _correlate_transpose(gy, ky, dy)

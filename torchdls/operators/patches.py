@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_alike, check_dtype, check_field, check_real, require
 from torchdls._tracing import is_recorded
 
 
@@ -91,20 +92,36 @@ class Patches:
         return slice(min(first * stride, last_start), min(last * stride, last_start) + size), slice(first, last + 1)
 
     def extract(self, z: Tensor) -> Tensor:
-        """All patches: (N, 1, H, W) -> (N, n, L), L = rows * columns of `grid`; each patch is contiguous in memory."""
+        """All patches: (N, 1, H, W) -> (N, n, L), L = rows * columns of `grid`; each patch is contiguous in memory.
+
+        TypeError for a dtype other than float32 and float64, ValueError for another shape.
+        """
+        check_field("Patches", "z", z, 1)
+        require(z.ndim == 4, f"Patches: z {tuple(z.shape)} given, (N, 1, H, W) is needed")
         return self._gather(z) if torch.compiler.is_compiling() else _Extract.apply(z, self)
 
     def adjoint(self, x: Tensor, shape: Sequence[int]) -> Tensor:
         """Exact transpose, summing overlaps: (N, n, L) -> (N, 1, H, W), with (H, W) the last two of `shape`."""
         size = (shape[-2], shape[-1])
+        self._check(x, size)
         return self._scatter(x, size) if torch.compiler.is_compiling() else _Adjoint.apply(x, self, size)
 
     def extract_onto(self, x: Tensor, z: Tensor) -> Tensor:
         """X + extract(z); where no derivative is recorded, x is overwritten and no copy of the patches is made."""
+        check_field("Patches", "z", z, 1)
+        self._check(x, z.shape[-2:])
+        check_alike("Patches", "z", z, x.dtype)
         if is_recorded(x, z):
             return x + self.extract(z)
         self._gather(z, x)
         return x
+
+    def _check(self, x: Tensor, size: Sequence[int]) -> None:
+        check_real("Patches", "x", x)
+        rows, columns = self.grid(size)
+        needed = f"(N, {self.n_pixels}, {rows * columns}) is needed"
+        fits = x.ndim == 3 and x.shape[1:] == (self.n_pixels, rows * columns)
+        require(fits, f"Patches: x {tuple(x.shape)} given, {needed}")
 
     # Patches lie in memory one after the other, so that a column of the (n, L) matrix is contiguous: products with few
     # atoms stream through them, and the patches that use an atom can be gathered.
@@ -157,6 +174,7 @@ class Patches:
 
     def coverage(self, shape: Sequence[int], *, dtype: torch.dtype, device: torch.device | str = "cpu") -> Tensor:
         """(1, 1, H, W): how many patches hold each pixel; the diagonal of sum_j P_j^T P_j."""
+        check_dtype("Patches", dtype)
         counts = [self._axis_coverage(m, axis, dtype, device) for axis, m in enumerate(shape[-2:])]
         return (counts[0][:, None] * counts[1])[None, None]
 

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchdls._checks import check_real
+from torchdls._checks import check_alike, check_real
 
 _BRIGHTEST = 0.9  # pixels of at least this part of the brightest one are the highlight
 
@@ -45,9 +45,7 @@ def lights_from_ball(images: Tensor, ball: Tensor) -> Tensor:
         tensor([[0.8700, 0.0000, 0.5000]])
     """
     check_real("lights_from_ball", "images", images)
-    if not isinstance(ball, Tensor) or ball.dtype != torch.bool:
-        got = getattr(ball, "dtype", type(ball).__name__)
-        raise TypeError(f"lights_from_ball: ball is {got}, a bool tensor is needed")
+    check_alike("lights_from_ball", "ball", ball, torch.bool)
     if images.ndim != 3 or 0 in images.shape or ball.shape not in (images.shape[1:], (1, *images.shape[1:])):
         raise ValueError(
             f"lights_from_ball: images {tuple(images.shape)} and ball {tuple(ball.shape)} given, "

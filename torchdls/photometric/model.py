@@ -79,9 +79,7 @@ def check(name: str, images: Tensor, lights: Tensor, mask: Tensor | None, lit: T
 
 def check_lights(name: str, lights: Tensor, like: Tensor, count: int | None = None) -> Tensor:
     """The lights as (N or 1, K, 3), on the device and in the dtype of the field they belong to."""
-    if not isinstance(lights, Tensor) or not lights.is_floating_point():
-        got = getattr(lights, "dtype", type(lights).__name__)
-        raise TypeError(f"{name}: lights is {got}, a floating-point tensor is needed")
+    check_real(name, "lights", lights)
     n = like.shape[0] if like.ndim == 4 else 1
     k = like.shape[-3] if count is None else count
     if tuple(lights.shape) not in {(k, 3), (1, k, 3), (n, k, 3)}:
@@ -89,6 +87,11 @@ def check_lights(name: str, lights: Tensor, like: Tensor, count: int | None = No
     if not holds_everywhere(lights.detach().isfinite()):
         raise ValueError(f"{name}: lights {tuple(lights.shape)} holds NaN or infinite values")
     return lights.to(like).reshape(-1, k, 3)
+
+
+def count_of(lights: Tensor) -> int:
+    """How many lights there are, where nothing else says how many there should be; 0 where they are none."""
+    return lights.shape[-2] if isinstance(lights, Tensor) and lights.ndim > 1 else 0
 
 
 def shading(b: Tensor, lights: Tensor) -> Tensor:

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
+from torchdls._checks import check_dtype, check_field, check_fit, check_real
 from torchdls.operators import as_pixel_size
-from torchdls.photometric.model import check_lights, shading
+from torchdls.photometric.model import check_lights, count_of, shading
 
 
 def ring_of_lights(
@@ -18,7 +19,8 @@ def ring_of_lights(
 ) -> Tensor:
     """Directions (count, 3) of lights on a ring, `tilt` degrees from the viewer; the first to the right.
 
-    ValueError unless there are at least three lights and the tilt is between 0 and 90 degrees.
+    ValueError unless there are at least three lights and the tilt is between 0 and 90 degrees; TypeError for a dtype
+    other than float32 and float64.
 
     Example:
         >>> torchdls.ring_of_lights(3, tilt=30).round(decimals=2)
@@ -26,6 +28,7 @@ def ring_of_lights(
                 [-0.2500,  0.4300,  0.8700],
                 [-0.2500, -0.4300,  0.8700]])
     """
+    check_dtype("ring_of_lights", dtype)
     if count < 3 or not 0 < tilt < 90:
         raise ValueError(f"count={count!r}, tilt={tilt!r}: at least 3 lights between 0 and 90 degrees are needed")
     turn = torch.arange(count, dtype=torch.float64, device="cpu") * (2 * math.pi / count)
@@ -67,7 +70,8 @@ def render(
         Images (N, K, H, W), or (K, H, W) for unbatched normals.
 
     Raises:
-        TypeError: normals or lights are not floating-point tensors.
+        TypeError: normals or lights are not float32 or float64, the albedo is of another dtype than the normals, or
+            the shadow is not bool.
         ValueError: a shape does not fit, or an option is out of range.
 
     Example:
@@ -76,19 +80,16 @@ def render(
         >>> torchdls.render(facing, lights, albedo=0.5).flatten()
         tensor([0.5000, 0.4000, 0.4000])
     """
-    if not isinstance(normals, Tensor) or normals.dtype not in (torch.float32, torch.float64):
-        got = getattr(normals, "dtype", type(normals).__name__)
-        raise TypeError(f"render: normals is {got}, a tensor of float32 or float64 is needed")
-    if normals.ndim not in (3, 4) or normals.shape[-3] != 3:
-        raise ValueError(f"render: normals {tuple(normals.shape)} given, (N, 3, H, W) or (3, H, W) is needed")
+    check_field("render", "normals", normals, 3)
     if not highlight >= 0 or not shininess > 0 or (snr_db is not None and not math.isfinite(snr_db)):
         raise ValueError(
             f"render: highlight={highlight!r} must be at least 0, shininess={shininess!r} positive and "
             f"snr_db={snr_db!r} None or finite"
         )
     n = normals if normals.ndim == 4 else normals[None]
-    lights = check_lights("render", lights, n, count=lights.shape[-2] if isinstance(lights, Tensor) else 0)
+    lights = check_lights("render", lights, n, count=count_of(lights))
     lambert = shading(n, lights)
+    _check_beside(normals, albedo, shadow, lights.shape[-2])
     images = albedo * lambert.clamp(min=0)
     if highlight:
         strength = lights.norm(dim=-1, keepdim=True)
@@ -103,6 +104,16 @@ def render(
         noise = torch.randn(images.shape, generator=generator, dtype=torch.float64, device=source)
         images = images + sigma * noise.to(images)
     return images if normals.ndim == 4 else images[0]
+
+
+def _check_beside(normals: Tensor, albedo: Tensor | float, shadow: Tensor | None, count: int) -> None:
+    """An albedo, one number or a field, and shadows that fit the normals."""
+    if isinstance(albedo, Tensor) and albedo.ndim:
+        check_fit("render", "albedo", albedo, normals, "normals", channels=(1,), scalar=True)
+    elif isinstance(albedo, Tensor):
+        check_real("render", "albedo", albedo)
+    if shadow is not None:
+        check_fit("render", "shadow", shadow, normals, "normals", channels=(1, count), dtype=torch.bool)
 
 
 def cast_shadows(height: Tensor, lights: Tensor, pixel_size: float | Sequence[float] = 1.0) -> Tensor:
@@ -120,7 +131,7 @@ def cast_shadows(height: Tensor, lights: Tensor, pixel_size: float | Sequence[fl
         (N, K, H, W) bool, or (K, H, W); True in the shadow. Attached shadows (l . n <= 0) are `render`'s own.
 
     Raises:
-        TypeError: an argument is not a floating-point tensor.
+        TypeError: an argument is not a tensor of float32 or float64.
         ValueError: a shape does not fit, or a light is not above the horizon.
 
     Example:
@@ -129,13 +140,9 @@ def cast_shadows(height: Tensor, lights: Tensor, pixel_size: float | Sequence[fl
         >>> torchdls.cast_shadows(height, torch.tensor([[0.6, 0.0, 0.8]]))  # the light stands at the right
         tensor([[[[ True,  True, False, False, False]]]])
     """
-    if not isinstance(height, Tensor) or height.dtype not in (torch.float32, torch.float64):
-        got = getattr(height, "dtype", type(height).__name__)
-        raise TypeError(f"cast_shadows: height is {got}, a tensor of float32 or float64 is needed")
-    if height.ndim not in (3, 4) or height.shape[-3] != 1 or 0 in height.shape:
-        raise ValueError(f"cast_shadows: height {tuple(height.shape)} given, (N, 1, H, W) or (1, H, W) is needed")
+    check_field("cast_shadows", "height", height, 1)
     z = (height if height.ndim == 4 else height[None]).detach()
-    lights = check_lights("cast_shadows", lights, z, count=lights.shape[-2] if isinstance(lights, Tensor) else 0)
+    lights = check_lights("cast_shadows", lights, z, count=count_of(lights))
     if bool((lights[..., 2] <= 0).any()):
         raise ValueError(f"cast_shadows: a light of {tuple(lights.shape)} is not above the horizon (z > 0)")
     steps = as_pixel_size(pixel_size)

@@ -9,12 +9,15 @@ from torch import Tensor
 
 from torchdls._tracing import is_concrete, is_recorded
 from torchdls.operators import dct2, idct2, neumann_eigenvalues, slope_divergence
-from torchdls.operators.cosine import MATRIX_LIMIT, from_half_spectrum, half_spectrum, mirrored
+from torchdls.operators.cosine import MATRIX_LIMIT, cosine_matrix, from_half_spectrum, half_spectrum, mirrored
 from torchdls.operators.tables import table
 from torchdls.solvers.cg import LinearMap
 
 # Pixels of small surfaces that are transformed together: they stay in the cache from one pass to the next.
 _IN_CACHE = 2**18
+
+# Sides up to which four products with matrices are faster than the FFT and what it needs around it (measured on a CPU).
+_PRODUCTS = 128
 
 
 def solve_direct(b: Tensor, r: Tensor | float | None, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
@@ -28,14 +31,74 @@ def solve_direct(b: Tensor, r: Tensor | float | None, pixel_size: tuple[float, f
         pixel_size: (dx, dy).
     """
     r = torch.as_tensor(r, dtype=b.dtype, device=b.device) if isinstance(r, int | float) else r
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling() or not is_recorded(b, *([] if r is None else [r])):
         return direct_map((b.shape[-2], b.shape[-1]), r, pixel_size, b)(b)
     return _Direct.apply(b, r, pixel_size)
 
 
 def integrate_direct(gradient: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
     """argmin_z ||A z - v||^2 (N, 1, H, W) for the slopes v = `edge_slopes(gradient)` of full rectangles, mean 0."""
-    return _few_at_a_time(lambda g: solve_direct(slope_divergence(g, pixel_size), None, pixel_size), gradient)
+    if max(gradient.shape[-2:]) <= _PRODUCTS:
+        return _few_at_a_time(lambda g: _by_products(g, pixel_size), gradient)
+    if is_recorded(gradient):
+        return _few_at_a_time(lambda g: solve_direct(slope_divergence(g, pixel_size), None, pixel_size), gradient)
+    solve_part = direct_map((gradient.shape[-2], gradient.shape[-1]), None, pixel_size, gradient, overwrite=True)
+    return _few_at_a_time(lambda g: solve_part(slope_divergence(g, pixel_size)), gradient)
+
+
+def _by_products(gradient: Tensor, pixel_size: tuple[float, float]) -> Tensor:
+    """`integrate_direct` of small surfaces as products with matrices of their sides, which any transform can follow.
+
+        z = C_y^T (gain * (C_y g_x (C_x T_x)^T + C_y T_y g_y C_x^T)) C_x
+
+    with the cosine matrices C, the divergence along a line T (see `slope_divergence`), and gain = 1 / eigenvalue.
+    """
+    (h, w), (dx, dy) = gradient.shape[-2:], pixel_size
+    across, down = _across(w, dx, like=gradient), _down(h, dy, like=gradient)
+    back, forth, gain = _cosines(h, like=gradient), cosine_matrix(w, like=gradient), _gain(h, w, dx, dy, like=gradient)
+    if gradient.shape[0] == 1 and not torch.compiler.is_compiling():  # the same by plain products, without a batch
+        sums = down.mm(gradient[0].bmm(across).view(2 * h, w))
+        return back.mm(sums * gain).mm(forth)[None, None]
+    sums = down @ (gradient @ across).flatten(1, 2)
+    return (back @ (sums * gain) @ forth)[:, None]
+
+
+@table
+def _across(w: int, dx: float) -> Tensor:
+    """(2, W, W): what the rows of g_x and of g_y are multiplied by from the right."""
+    cosines = _cosine(w)
+    return torch.stack([(cosines @ _line_divergence(w, dx)).mT, cosines.mT])
+
+
+@table
+def _down(h: int, dy: float) -> Tensor:
+    """(H, 2H): by what the columns of both are multiplied from the left, and then added up."""
+    cosines = _cosine(h)
+    return torch.cat([cosines, cosines @ _line_divergence(h, dy)], 1)
+
+
+@table
+def _cosines(n: int) -> Tensor:
+    """The transpose of the cosine matrix, contiguous."""
+    return _cosine(n).mT.contiguous()
+
+
+@table
+def _gain(h: int, w: int, dx: float, dy: float) -> Tensor:
+    return _inverse(neumann_eigenvalues((h, w), torch.zeros(0, dtype=torch.float64, device="cpu"), (dx, dy)))
+
+
+def _cosine(n: int) -> Tensor:
+    return cosine_matrix(n, like=torch.zeros(0, dtype=torch.float64, device="cpu"))
+
+
+def _line_divergence(n: int, d: float) -> Tensor:
+    """(n, n) matrix of (g_{j-1} - g_{j+1}) / 2d along a line, continued with opposite sign; a part of tables."""
+    one = torch.ones(n - 1, dtype=torch.float64, device="cpu")
+    T = torch.diag(one, -1) - torch.diag(one, 1)
+    T[0, 0] -= 1
+    T[-1, -1] += 1
+    return T * (0.5 / d)
 
 
 def _few_at_a_time(height: LinearMap, x: Tensor) -> Tensor:
@@ -51,20 +114,28 @@ def _few_at_a_time(height: LinearMap, x: Tensor) -> Tensor:
     return result
 
 
-def direct_map(size: tuple[int, int], r: Tensor | None, pixel_size: tuple[float, float], like: Tensor) -> LinearMap:
-    """The map b -> (A^T A + r)^{-1} b for repeated use: its gains are computed once."""
+def direct_map(
+    size: tuple[int, int],
+    r: Tensor | None,
+    pixel_size: tuple[float, float],
+    like: Tensor,
+    overwrite: bool = False,
+) -> LinearMap:
+    """The map b -> (A^T A + r)^{-1} b for repeated use: its gains are computed once. It may overwrite b on request."""
     if max(size) <= MATRIX_LIMIT:
-        eigenvalues = neumann_eigenvalues(size, like, pixel_size)
-        gain = _inverse(eigenvalues if r is None else eigenvalues + r)
+        if r is None:
+            gain = _gain(*size, *pixel_size, like=like)
+        else:
+            gain = _inverse(neumann_eigenvalues(size, like, pixel_size) + r)
         return lambda b: idct2(dct2(b) * gain)
     own, other = _tables(size, r, pixel_size, like)
 
     def solve_part(b: Tensor) -> Tensor:
-        spectrum = half_spectrum(b)
+        spectrum, room = half_spectrum(b)
         values = torch.view_as_real(spectrum)
         opposite = torch.view_as_real(mirrored(spectrum))
         values.mul_(own)[..., 1:, :, :].addcmul_(opposite, other, value=-1)
-        return from_half_spectrum(spectrum, size)
+        return from_half_spectrum(spectrum, room, b if overwrite else None)
 
     alike = own.ndim == 3 or len(own) == 1  # one table for all surfaces
     return (lambda b: _few_at_a_time(solve_part, b)) if alike else solve_part

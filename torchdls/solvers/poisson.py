@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_alike, check_real
 from torchdls._tracing import all_finite
 from torchdls.operators import GradientOperator, as_pixel_size
 from torchdls.operators.edges import edge_ends, present_edges
@@ -124,6 +125,7 @@ def solve(
         SolveResult(height, iterations, residual, converged).
 
     Raises:
+        TypeError: v is not float32 or float64, or another tensor of another dtype.
         ValueError: a shape does not fit, `tol`, `max_iter` or `pixel_size` is not positive, or the height is not
             finite.
 
@@ -135,6 +137,7 @@ def solve(
         tensor([[[[-1.5000, -0.5000,  0.5000,  1.5000]]]])
     """
     setting = _Setting(as_pixel_size(pixel_size), tol, max_iter)
+    check_real("solve", "v", v)
     r = _as_weight(anchor_weight, v)
     _check(v, setting, w=w, anchor=anchor, anchor_weight=r, z0=z0)
     if w is None and (r is None or r[0].numel() == 1):
@@ -206,6 +209,7 @@ def _check(v: Tensor, setting: _Setting, **fields: Tensor | None) -> None:
     for name, field in fields.items():
         if field is None:
             continue
+        check_alike("solve", name, field, v.dtype)
         channels = (1, 2) if name == "w" else (1,)
         sizes = (v.shape[2:], (1, 1)) if name == "anchor_weight" else (v.shape[2:],)
         fits = field.ndim == 4 and field.shape[0] in (1, v.shape[0])

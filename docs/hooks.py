@@ -1,0 +1,90 @@
+"""The reference of the site: every public name, grouped by room, and the registries as tables."""
+
+import importlib
+from pathlib import Path
+
+from mkdocs.structure.files import File, Files
+
+ROOMS = {
+    "integrators": "Integrators",
+    "selection": "Choice by predicted risk",
+    "noise": "Noise",
+    "geometry": "Normals, conventions, cameras",
+    "photometric": "Photometric stereo",
+    "io": "Files",
+    "persistence": "Integrators in files",
+    "dictionary": "Dictionaries",
+    "solvers": "The solve",
+    "operators": "Operators",
+    "metrics": "Metrics",
+    "surfaces": "Surfaces to try methods on",
+    "plot": "Pictures",
+}
+TABLES = {"INTEGRATORS": "integrators", "LEARNERS": "dictionary", "PHOTOMETRIC": "photometric"}
+
+
+RESULTS = Path("benchmarks") / "results"
+
+
+def on_files(files: Files, config) -> Files:
+    """Add `api.md`, and the pictures and tables of the benchmarks."""
+    files.append(File.generated(config, "api.md", content=reference()))
+    for path in sorted([*RESULTS.glob("*.png"), *RESULTS.glob("*.md")]):
+        files.append(File.generated(config, f"benchmarks/{path.name}", abs_src_path=str(path.resolve())))
+    return files
+
+
+def on_page_markdown(markdown: str, page, **_) -> str:
+    """Links to them, as the repository has them, lead to their places on the site."""
+    return markdown.replace("](../benchmarks/results/", "](benchmarks/").replace("](CHANGELOG.md)", "")
+
+
+def reference() -> str:
+    """The page: a section for each room, in it a reference to each public name."""
+    import torchdls
+
+    rooms: dict[str, list[str]] = {room: [] for room in ROOMS}
+    for name in public_names():
+        value = getattr(torchdls, name)
+        module = value.__module__ if hasattr(value, "__name__") else room_of(name)
+        rooms.setdefault(module.split(".")[1], []).append(name)
+    parts = ["# Reference\n\nEvery public name; all of them import from `torchdls`.\n"]
+    for room, names in rooms.items():
+        if names:
+            parts.append(f"\n## {ROOMS.get(room, room)}\n")
+            parts += [table(name) if name in TABLES else entry(name) for name in names]
+    return "\n".join(parts)
+
+
+def public_names() -> list[str]:
+    """The names of the stub, in its order."""
+    stub = Path(importlib.import_module("torchdls").__file__ or "").with_suffix(".pyi")
+    lines = stub.read_text(encoding="utf-8").splitlines()
+    return [line.split(" as ")[-1] for line in lines if line.startswith("from .")]
+
+
+def room_of(name: str) -> str:
+    """The room of a constant, which knows no module: that of the line of the stub."""
+    stub = Path(importlib.import_module("torchdls").__file__ or "").with_suffix(".pyi")
+    lines = stub.read_text(encoding="utf-8").splitlines()
+    return next(f"torchdls.{line.split()[1][1:]}" for line in lines if line.endswith(f" as {name}"))
+
+
+def entry(name: str) -> str:
+    """A reference to a class or function by the module that defines it."""
+    import torchdls
+
+    value = getattr(torchdls, name)
+    module = getattr(value, "__module__", None)
+    if module is None or not hasattr(value, "__name__"):
+        return f"### {name}\n\n`torchdls.{name}`: a table of {', '.join(f'`{key}`' for key in value)}.\n"
+    return f"::: {module}.{value.__name__}\n"
+
+
+def table(name: str) -> str:
+    """A registry: its names, and the first line of what each is."""
+    import torchdls
+
+    registry = getattr(torchdls, name)
+    rows = [f"| `{key}` | {registry.summary(key)} |" for key in registry]
+    return "\n".join([f"### {name}\n", "| name | |", "|---|---|", *rows, ""])
