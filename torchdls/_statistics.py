@@ -13,3 +13,10 @@ def masked_median(x: Tensor, live: Tensor) -> Tensor:
     some = live.any(1, keepdim=True)
     ends = torch.where(some, x.new_full((), torch.nan), 0)  # a number for the rows that have none
     return torch.cat([torch.where(live, x, torch.nan), ends], 1).nanmedian(1).values
+
+
+def midpoint_median(x: Tensor, live: Tensor) -> Tensor:
+    """Median of the live numbers of the last dimension, at least one: for an even count, the mean of the middle two."""
+    ordered, count = torch.where(live, x, torch.inf).sort(-1).values, live.sum(-1, keepdim=True)
+    middle = torch.cat([(count - 1) // 2, count // 2], -1)
+    return ordered.gather(-1, middle).mean(-1)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchdls._checks import check_field, check_fit
 from torchdls._precision import full_precision
+from torchdls._statistics import midpoint_median
 from torchdls.operators import as_pixel_size
 
 if TYPE_CHECKING:
@@ -185,8 +186,8 @@ def mean_absolute_depth_error(depth: Tensor, reference: Tensor, mask: Tensor | N
     """
     depth, reference, mask = _fields("mean_absolute_depth_error", depth, reference, mask)
     depth, reference = torch.where(mask, depth, 1), torch.where(mask, reference, 0)
-    ratio = torch.where(mask, reference / depth, torch.nan).flatten(-3)
-    scale = _median(ratio)
+    ratio = (reference / depth).flatten(-3)
+    scale = midpoint_median(ratio, mask.flatten(-3) & ~ratio.isnan())
     return _mean(torch.where(mask, scale[..., None, None, None] * depth - reference, 0).abs(), mask)
 
 
@@ -231,13 +232,6 @@ def _angle(a: Tensor, b: Tensor) -> Tensor:
     sine = torch.linalg.vector_norm(torch.linalg.cross(normal_a, normal_b, dim=-3), dim=-3, keepdim=True)
     cosine = (normal_a * normal_b).sum(-3, keepdim=True)
     return torch.atan2(sine, cosine).rad2deg()
-
-
-def _median(values: Tensor) -> Tensor:
-    """Median of the last dimension without the NaN: for an even count, the mean of the two middle values."""
-    ordered, count = values.sort(-1).values, (~values.isnan()).sum(-1, keepdim=True)
-    middle = torch.cat([(count - 1) // 2, count // 2], -1)
-    return ordered.gather(-1, middle).mean(-1)
 
 
 def _dilate(outside: Tensor) -> Tensor:

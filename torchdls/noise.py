@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchdls._checks import check_field, check_fit, require
 from torchdls._precision import full_precision
-from torchdls._statistics import NORMAL_MEDIAN
+from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls._tracing import holds_everywhere
 from torchdls.operators import as_pixel_size, dst2, edge_slopes
 from torchdls.operators.cosine import cosine_matrix
@@ -152,9 +152,9 @@ def _robust_scale(x: Tensor, valid: Tensor | None = None) -> Tensor:
     normals.
     """
     magnitude = x.detach().abs()
-    candidates = magnitude if valid is None else torch.where(valid, magnitude, torch.nan)
-    limit = _CUT * candidates.flatten(1).nanmedian(1).values / NORMAL_MEDIAN
-    kept = candidates <= limit[:, None, None]
+    live = torch.ones_like(x, dtype=torch.bool) if valid is None else valid.expand_as(x)
+    limit = _CUT * masked_median(magnitude.flatten(1), live.flatten(1)) / NORMAL_MEDIAN
+    kept = live & (magnitude <= limit[:, None, None])
     norm = torch.linalg.vector_norm(torch.where(kept, x, 0), dim=(-2, -1))  # derivative 0, not NaN, at 0
     return norm / (_TRIMMED_VARIANCE * kept.sum((-2, -1), dtype=x.dtype).clamp(min=1)).sqrt()
 

@@ -10,6 +10,7 @@ from torchdls.operators.edges import (
     complete_cells,
     edge_ends,
     edges_at_pixels,
+    edges_behind,
     present_edges,
 )
 
@@ -34,13 +35,16 @@ def test_present_edges_are_those_between_two_pixels():
 
 def test_sums_over_the_edges_at_a_pixel():
     v = edge_field()
-    both, each = torch.zeros(2, 1, H, W, dtype=v.dtype), torch.zeros_like(v)
+    both, each, behind = torch.zeros(2, 1, H, W, dtype=v.dtype), torch.zeros_like(v), torch.zeros_like(v)
     for c, i, j in HERE:
         for a, b in ends(c, i, j):
             both[:, 0, a, b] += v[:, c, i, j]
             each[:, c, a, b] += v[:, c, i, j]
+        far = ends(c, i, j)[1]
+        behind[:, c, far[0], far[1]] = v[:, c, i, j]
     torch.testing.assert_close(edge_ends(v), both)
     torch.testing.assert_close(edges_at_pixels(v), each)
+    assert torch.equal(edges_behind(v), behind)
 
 
 def test_curl_goes_around_each_cell():

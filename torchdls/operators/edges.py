@@ -189,10 +189,15 @@ def present_edges(v: Tensor) -> Tensor:
     return _stack_edges(ones[..., :, :-1], ones[..., :-1, :])
 
 
+def edges_behind(field: Tensor) -> Tensor:
+    """The edge field at the edge behind each pixel, 0 where there is none: (.., 2, H, W)."""
+    x, y = field.split(1, -3)
+    return torch.cat([F.pad(x[..., :, :-1], (1, 0)), F.pad(y[..., :-1, :], (0, 0, 1, 0))], -3)
+
+
 def edges_at_pixels(field: Tensor) -> Tensor:
     """Sum of an edge field over the two edges at each pixel, the one ahead and the one behind: (.., 2, H, W)."""
-    x, y = field.split(1, -3)
-    return field + torch.cat([F.pad(x[..., :, :-1], (1, 0)), F.pad(y[..., :-1, :], (0, 0, 1, 0))], -3)
+    return field + edges_behind(field)
 
 
 def edge_ends(w: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls._tracing import seen_everywhere
 from torchdls.integrators.base import Fields
 from torchdls.operators import GradientOperator, edge_slopes, present_edges
+from torchdls.operators.edges import edges_behind
 
 _LEAST_NOISE = 1e-3  # of the root mean square slope: noise below it is treated as this much
 
@@ -103,8 +104,7 @@ class Terms(NamedTuple):
 
 def _spread(edges: Tensor, joint: bool) -> Tensor:
     """An edge field (N, 2, H, W) as each pixel sees it, ahead and behind: (N, M, 2, H, W)."""
-    x, y = edges.unbind(1)
-    before, above = pad(x[..., :-1], (1, 0)), pad(y[..., :-1, :], (0, 0, 1, 0))
+    (x, y), (before, above) = edges.unbind(1), edges_behind(edges).unbind(1)
     pairs = ((x, y), (x, above), (before, y), (before, above)) if joint else ((x, y), (before, above))
     return torch.stack([torch.stack(pair, 1) for pair in pairs], 1)
 
