@@ -31,12 +31,15 @@ noisy = lambda g: torchdls.add_noise(g, 10, torch.Generator().manual_seed(0))  #
 # name -> function of tensors, and the tensors
 CALLS: dict[str, tuple[Any, ...]] = {
     "add_noise": (noisy, g),
+    "bivariate_normals": (lambda i, k: torchdls.bivariate_normals(i, k, n_iter=5).normals, images, lights),
     "cast_shadows": (torchdls.cast_shadows, z, lights),
     "convert_gradient": (lambda g: torchdls.convert_gradient(g, "depth"), g),
     "convert_normals": (lambda n: torchdls.convert_normals(n, "directx"), n),
     "dct2": (torchdls.dct2, z),
     "dct2 by FFT": (torchdls.dct2, big),
     "depth_to_points": (torchdls.depth_to_points, z.exp(), camera),
+    "dlnv_normals": (lambda i, k: torchdls.dlnv_normals(i, k, patch_size=3, n_iter=1).normals, images, lights),
+    "dlpi_normals": (lambda i, k: torchdls.dlpi_normals(i, k, patch_size=3, n_iter=1).normals, images, lights),
     "dls_objective": (lambda z, g, d, b: dls_objective(z, g, d, b, 0.5, 0.1, patches=Patches(3, 3)), z[..., :15, :12],
                       g[..., :15, :12], D, B),
     "edge_slopes": (lambda g: torchdls.edge_slopes(g)[0], g),
@@ -47,6 +50,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "height_to_points": (torchdls.height_to_points, z),
     "idct2": (torchdls.idct2, z),
     "idct2 by FFT": (torchdls.idct2, big),
+    "lights_from_ball": (lambda i: torchdls.lights_from_ball(i, torch.ones(6, 5, dtype=torch.bool)), images[0]),
     "log_depth_to_depth": (torchdls.log_depth_to_depth, z),
     "low_rank_normals": (lambda i, k: torchdls.low_rank_normals(i, k).normals, images, lights),
     "mean_absolute_depth_error": (torchdls.mean_absolute_depth_error, z.exp(), z.exp() + 0.1),
@@ -58,6 +62,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "orthogonal_matching_pursuit": (lambda p, d: orthogonal_matching_pursuit(p, d, 3), P, D),
     "Patches": (Patches(4, 2).extract, z),
     "Patches.adjoint": (lambda x: Patches(3, 3).adjoint(x, (12, 15)), P),
+    "refine": (lambda z, i, k: torchdls.refine(z, i, k, n_iter=2).height, z[..., :6, :5], images, lights),
     "render": (torchdls.render, n, lights),
     "rmse": (torchdls.rmse, z, z.square()),
     "select": (lambda g: torchdls.select(lambda x: torchdls.HarkerOLeary()(x), g, 1).height, g),
@@ -76,8 +81,8 @@ CALLS: dict[str, tuple[Any, ...]] = {
 # What takes no tensor, gives no tensor, reads or draws a file, or is tested over its registry.
 OTHERS = {
     "ring_of_lights", "dct_dictionary", "terrain", "guess_convention", "build", "load", "save", "load_camera",
-    "load_field", "load_height", "load_mask", "save_height", "save_mesh", "compare_heights", "hillshade", "page_html",
-    "surface_page",
+    "load_field", "load_height", "load_mask", "load_photographs", "save_normals", "save_height", "save_mesh",
+    "compare_heights", "hillshade", "page_html", "surface_page",
 }  # fmt: skip
 _CAST = torch.empty(0).device.type
 

@@ -61,7 +61,7 @@ def test_horn_brooks_meets_anchors_far_from_zero(weight):
 
 FORMS: list[tuple[str, Options]] = [(name, {}) for name in INTEGRATORS]
 FORMS += [("slope_dls", {"recipe": "quick"}), ("slope_dls", {"recipe": "plain"}), ("slope_dls", {"sigma": 0.0})]
-FORMS += [("dls", {"learner": "dino_kat", "unused": "first"}), ("dls", {"learn": "fixed"}), ("dls", {"mu": "auto"})]
+FORMS += [("dls", {"learner": "dino_kat"}), ("dls", {"learner": "fixed"}), ("dls", {"mu": "auto"})]
 FORMS += [("l1", {"smoothing": 0.0}), ("total_variation", {"smoothing": 0.0}), ("mumford_shah", {"width": 0.0})]
 FORMS += [("m_estimator", {"loss": "tukey"}), ("least_squares", {"boundary": "dirichlet"})]
 

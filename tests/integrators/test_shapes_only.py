@@ -11,8 +11,6 @@ import torchdls
 from tests.helpers import MASKS, random_field, uniform_field
 from tests.helpers.methods import bumps, everything, method
 from torchdls import DLS, INTEGRATORS, LeastSquares, SlopeDLS, Unroll
-from tests.helpers.methods import Options, bumps, everything, method
-from torchdls import DLS, INTEGRATORS, LeastSquares, SlopeDLS
 from torchdls.operators import dct2
 from torchdls.selection import _bands, _most_bands
 
@@ -26,7 +24,7 @@ def fixed(name, **more):
 
 FORMS: list[tuple[str, dict[str, Any]]] = [(name, {}) for name in INTEGRATORS]
 FORMS += [
-    ("dls", {"learn": "fixed"}),
+    ("dls", {"learner": "fixed"}),
     ("dls", {"select": True, "mu": "auto"}),
     ("dls", {"derivative": Unroll(checkpoint=True)}),
 ]

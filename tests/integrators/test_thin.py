@@ -76,7 +76,7 @@ def test_dls_without_room_for_a_patch_is_its_data_term(size):
     anchors = {"anchor": random_field(2, 1, *size, seed=1), "anchor_weight": 0.3}
     for given in ({}, anchors):
         for data_term in (LeastSquares(), Huber()):
-            for options in ({}, {"mu": 0.5}, {"learn": "shared"}, {"learn": "fixed"}):
+            for options in ({}, {"mu": 0.5}, {"learn": "shared"}, {"learner": "fixed"}):
                 found = DLS(data_term=data_term, pixel_size=0.5, **options).solve(g, **given)
                 expected = type(data_term)(pixel_size=0.5)(g, **given)
                 torch.testing.assert_close(found.height, expected, rtol=0, atol=1e-9)

@@ -199,8 +199,9 @@ def _shapes_alone(v: Tensor, w: Tensor, anchor: Tensor | None, r: Tensor | None)
 
 def direct_result(z: Tensor) -> SolveResult:
     """What a direct solve gave, as a result of `solve`."""
-    zeros = torch.zeros(z.shape[0], dtype=z.dtype, device=z.device)
-    return SolveResult(z, zeros.long(), zeros, zeros == 0)
+    n, device = z.shape[0], z.device
+    steps, residual = torch.zeros(n, dtype=torch.int64, device=device), torch.zeros(n, dtype=z.dtype, device=device)
+    return SolveResult(z, steps, residual, torch.ones(n, dtype=torch.bool, device=device))
 
 
 def _A(setting: _Setting) -> GradientOperator:
