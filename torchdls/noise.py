@@ -84,6 +84,7 @@ def noise_level(
         0.1
     """
     steps = as_pixel_size(pixel_size)
+    check_field("noise_level", "gradient", gradient, 2)
     single = gradient.ndim == 3
     if single:
         gradient = gradient[None]
@@ -102,7 +103,7 @@ def noise_if_told(
 
     Fields of a single row or column have no cell; a mask may leave none.
     """
-    n, (dx, dy) = len(gradient), pixel_size
+    n, (dx, dy) = gradient.shape[0], pixel_size  # not len(), which a graph for every batch size cannot follow
     if min(gradient.shape[-2:]) < 2:
         return gradient.new_zeros(n), torch.zeros(n, dtype=torch.bool, device=gradient.device)
     v, w = edge_slopes(gradient, mask, weight)
