@@ -92,16 +92,19 @@ class Run:
         return average(parts)
 
     def _code(self, places: Places, slopes: Tensor, level: Tensor, steps: tuple[float, float]) -> Coded:
-        coefficients = places.analyse(slopes)
-        kept = coefficients.abs() > level * places.noise(slopes, steps, self.turned)
-        coefficients = torch.where(kept, coefficients, 0)
-        if self.weights == "equal":
-            one = torch.ones_like(places.patchwise(coefficients)[:1, :1, :, 0, :, 0])
-            return Coded(places.synthesise(coefficients), places.spread(one))
-        count = places.patchwise(kept).sum((-3, -1))
-        weight = (places.size**2 if self.weights == "size" else 1) / (1 + count).to(slopes.dtype)
-        weighted = (places.patchwise(coefficients) * weight[..., :, None, :, None]).view_as(coefficients)
-        return Coded(places.synthesise(weighted), places.spread(weight))
+        strips, totals, weights = places.down(slopes), [], []
+        for rows in places.strips(len(slopes)):
+            coefficients = places.across(strips[..., rows, :])
+            limit = level[..., None] * places.noise(slopes, steps, self.turned, rows)
+            kept = (coefficients.detach().abs() - limit.detach()).relu().sign()  # 1 above the threshold, else 0
+            coefficients = coefficients * kept
+            if self.weights != "equal":
+                count = kept.sum(0).sum(-1)
+                weights.append((places.size**2 if self.weights == "size" else 1) / (1 + count))
+                coefficients = coefficients * weights[-1][..., None]
+            totals.append(places.back_across(coefficients))
+        total = places.back_down(torch.cat(totals, -2))
+        return Coded(total, places.spread(torch.cat(weights, 2)) if weights else places.coverage(slopes))
 
 
 FOUR = (
