@@ -8,8 +8,9 @@ from tests.helpers import DISK, random_field, seeded
 from torchdls import SURFACES, LeastSquares, SlopeDLS, add_noise, rmse, ssim
 from torchdls.integrators.slope_dls.bases import Places
 from torchdls.integrators.slope_dls.blend import least_in_simplex, signs, sure_weights
+from torchdls.integrators.slope_dls.known import Known
 from torchdls.integrators.slope_dls.lines import atoms
-from torchdls.integrators.slope_dls.runs import FOUR, Run, smooth
+from torchdls.integrators.slope_dls.runs import FOUR, HOLED, Run, smooth
 from torchdls.integrators.slope_dls.waves import cautious, shrink_slow_waves
 from torchdls.noise import height_noise
 from torchdls.operators import GradientOperator, dct2, idct2
@@ -236,10 +237,96 @@ def test_a_batch_of_whole_and_holed_surfaces():
     mask = torch.cat([torch.ones(1, 1, 32, 32, dtype=torch.bool), DISK(32, 32)])
     result = SlopeDLS(n_iter=4, z_tol=1e-10).solve(gradient, mask)
     torch.testing.assert_close(result.height[:1], SlopeDLS(n_iter=4, z_tol=1e-10)(gradient[:1]))
-    holed = SlopeDLS(n_iter=4, z_tol=1e-10, recipe="plain").solve(gradient[1:], mask[1:])
-    torch.testing.assert_close(result.height[1:], holed.height)
-    torch.testing.assert_close(result.misfit[1:], holed.misfit)
-    assert SlopeDLS().solve(gradient, mask).misfit.shape == (2, 17)
+    holed = SlopeDLS(n_iter=4, z_tol=1e-10).solve(gradient[1:], mask[1:])
+    torch.testing.assert_close(result.height[1:], holed.height, atol=1e-7, rtol=0)
+    assert result.misfit.shape == (2, 5)
+    assert SlopeDLS.fast().solve(gradient, mask).misfit.shape == (2, 7)
+
+
+# Holes, weights, anchors
+
+
+def test_patches_know_what_lies_in_them():
+    places = Places((20, 31), 8, 3)
+    valid = (random_field(1, 2, 20, 31) > 0).double()
+    trust = random_field(1, 2, 20, 31, seed=1).exp()
+    known = Known(valid, trust)
+    weight, level = known.weight(places), known.level(places)
+    rows, columns = (line.positions for line in places.lines)
+    for j, top in enumerate(rows):
+        for i, left in enumerate(columns):
+            part = (..., slice(top, top + 8), slice(left, left + 8))
+            torch.testing.assert_close(weight[..., j, i], valid[part].mean((-2, -1)).square())
+            mean = (valid * trust)[part].sum((-2, -1)) / valid[part].sum((-2, -1))
+            torch.testing.assert_close(level[..., j, i], mean.rsqrt())
+    assert (Known(0 * valid, trust).level(places) == 1).all()
+
+
+def test_far_noise_is_that_of_the_middle_of_a_large_image():
+    for size, with_polynomials in ((8, False), (16, True)):
+        places, like = Places((160, 160), size, 0, with_polynomials), torch.empty(0, dtype=torch.float64)
+        middle = len(places.lines[0].positions) // 2
+        exact = places.noise(like, STEPS)[:, :, :, middle, middle]
+        torch.testing.assert_close(places.far_noise(like, STEPS)[:, :, :, 0, 0], exact, rtol=0.03, atol=0.05)
+
+
+def test_without_threshold_patches_of_holed_surfaces_code_everything():
+    slopes, valid = random_field(2, 2, 23, 31), torch.zeros(1, 2, 23, 31, dtype=torch.float64)
+    valid[..., 12:] = 1
+    coded = HOLED[0].code(slopes, torch.zeros(2, dtype=torch.float64), STEPS, 3, Known(valid, None))
+    torch.testing.assert_close(coded, slopes)  # measured, seen by a patch that knows, or left as they were
+
+
+@pytest.mark.parametrize("size, offset", [(8, 0), (8, 3), (17, 5), (64, 20)])
+def test_patches_of_a_window_are_those_of_the_whole(size, offset):
+    """Those that know nothing weigh nothing, so that a window around the others gives the same."""
+    slopes, valid = random_field(2, 2, 70, 160), torch.zeros(1, 2, 70, 160, dtype=torch.float64)
+    valid[..., 12:30, 60:131] = 1
+    places, known = Places((70, 160), size, offset), Known(valid, None)
+    noise = torch.full((2, 1, 1, 1), 0.8, dtype=torch.float64)
+    found = HOLED[0]._code(places, slopes, noise, STEPS, known)
+    far = places.far_noise(slopes, STEPS)
+    whole = HOLED[0]._code_patches(places, slopes, noise, lambda _: far, known.weight(places))
+    torch.testing.assert_close(found.total, whole.total)
+    torch.testing.assert_close(found.weight, whole.weight)
+    assert (found.weight == 0).any() or size == 64
+
+
+@pytest.mark.parametrize("recipe", ["blend", "quick"])
+def test_without_noise_holed_surfaces_are_least_squares(recipe):
+    surface = SURFACES["peaks"](32, dtype=torch.float64)
+    mask, method = DISK(32, 32), SlopeDLS(recipe=recipe, sigma=0.0)
+    plain = LeastSquares()(surface.gradient, mask)
+    torch.testing.assert_close(method(surface.gradient, mask), plain, atol=1e-4 * float(plain.abs().max()), rtol=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe, least", [("blend", 1.1), ("quick", 1.05)])
+def test_gain_over_least_squares_on_a_disk(recipe, least):
+    gains = []
+    for name in ("tent", "cone", "terrain"):
+        surface = terrain(64) if name == "terrain" else SURFACES[name](64)
+        gradient = torch.cat([add_noise(surface.gradient, 5, seeded(k)) for k in (10, 11)])
+        mask = DISK(64, 64)
+        truth = surface.height.expand(2, -1, -1, -1)
+        plain, found = LeastSquares()(gradient, mask), SlopeDLS(recipe=recipe)(gradient, mask)
+        gains.append(rmse(plain, truth, mask).mean() / rmse(found, truth, mask).mean())
+    assert min(gains) > 0.99
+    assert torch.stack(gains).log().mean().exp() > least
+
+
+def test_blend_by_a_probe_of_unequal_noise_takes_the_smooth_height():
+    """Half of the surface is four times as noisy; a plane under it is found better than by least squares."""
+    sigma = torch.full((1, 1, 40, 40), 0.1, dtype=torch.float64)
+    sigma[..., 20:] = 0.4
+    errors = []
+    for seed in range(3):
+        gradient = 0.3 + sigma * random_field(1, 2, 40, 40, seed=seed)
+        weight = 1 / sigma.square()
+        truth = LeastSquares()(torch.full_like(gradient, 0.3))
+        errors.append([rmse(m(gradient, weight=weight), truth) for m in (LeastSquares(), SlopeDLS())])
+    plain, found = torch.tensor(errors).mean(0)
+    assert found < 0.8 * plain
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 1)])

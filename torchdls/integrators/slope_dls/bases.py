@@ -31,13 +31,13 @@ class Places:
     Args:
         shape: (H, W) of the image.
         size: side of a patch, at most min(H, W).
-        offset: rows and columns by which the grid starts before the image.
+        offset: rows and columns by which the grid starts before the image, one number or one for each.
         smooth: bases of patches from 16 pixels on begin with polynomials.
     """
 
     shape: tuple[int, int]
     size: int
-    offset: int = 0
+    offset: int | tuple[int, int] = 0
     smooth: bool = True
 
     @classmethod
@@ -46,11 +46,37 @@ class Places:
         stride = max(1, size // 2)
         return cls(shape, size, round(iteration * _GOLDEN * stride) % stride, smooth)
 
+    @property
+    def offsets(self) -> tuple[int, int]:
+        """Of rows and columns."""
+        return (self.offset, self.offset) if isinstance(self.offset, int) else self.offset
+
     @cached_property
     def lines(self) -> tuple[Line, Line]:
         """The segments of the rows and the columns."""
-        rows, columns = (Line(n, self.size, self.offset, self.smooth) for n in self.shape)
-        return rows, columns
+        (h, w), (down, across) = self.shape, self.offsets
+        return Line(h, self.size, down, self.smooth), Line(w, self.size, across, self.smooth)
+
+    def within(self, live: Tensor) -> tuple[Places, tuple[slice, slice], tuple[slice, slice]]:
+        """The same patches on the smallest window that holds the live ones.
+
+        Args:
+            live: (rows, columns) bool of patches.
+
+        Returns:
+            The patches of the window, its rows and columns of pixels, and those of its patches.
+        """
+        pixels, patches, offsets = [], [], []
+        for line, dim, offset in zip(self.lines, (1, 0), self.offsets, strict=True):
+            alive = live.any(dim).nonzero().flatten()
+            first, last = (int(alive[0]), int(alive[-1])) if len(alive) else (0, 0)
+            patches.append(slice(first, last + 1))
+            pixels.append(slice(line.positions[first], line.positions[last] + self.size))
+            offsets.append(0 if first else offset)
+        (rows, columns), (down, across) = pixels, offsets
+        shape = (rows.stop - rows.start, columns.stop - columns.start)
+        part = Places(shape, self.size, (down, across), self.smooth)
+        return part, (rows, columns), (patches[0], patches[1])
 
     def strips(self, surfaces: int) -> Iterator[slice]:
         """Rows of patches, as many at a time as are to be held for so many surfaces of two components."""
@@ -107,9 +133,22 @@ class Places:
         """
         (h, spared), (w, out) = (_less(line) for line in self.lines)
         rows, columns = self.lines
-        found: Tensor = _noise((h, w), self.size, self.offset, self.smooth, tuple(steps), turned, like=like)
+        found: Tensor = _noise((h, w), self.size, self.offsets, self.smooth, tuple(steps), turned, like=like)
         found = _prolonged(found, 3, spared, *strips.indices(len(rows.positions))[:2])
         return _prolonged(found, 4, out, 0, len(columns.positions))
+
+    def far_noise(self, like: Tensor, steps: tuple[float, float]) -> Tensor:
+        """`noise` of a patch far from every border, (size, 1, 2, 1, 1, size)."""
+        found: Tensor = _far_noise(self.size, self.smooth, tuple(steps), like=like)
+        return found
+
+
+@table
+def _far_noise(size: int, smooth: bool, steps: tuple[float, float]) -> Tensor:
+    middle = Places((4 * size, 4 * size), size, 0, smooth)
+    found = middle.noise(torch.empty(0, dtype=torch.float64, device="cpu"), steps)
+    row, column = (len(line.positions) // 2 for line in middle.lines)
+    return found[..., row : row + 1, column : column + 1, :].contiguous()
 
 
 def _less(line: Line) -> tuple[int, int]:
@@ -132,12 +171,12 @@ def _prolonged(x: Tensor, dim: int, spared: int, start: int, end: int) -> Tensor
 
 
 def _build_noise(
-    shape: tuple[int, int], size: int, offset: int, smooth: bool, steps: tuple[float, float], turned: bool
+    shape: tuple[int, int], size: int, offsets: tuple[int, int], smooth: bool, steps: tuple[float, float], turned: bool
 ) -> Tensor:
     double = torch.empty(0, dtype=torch.float64, device="cpu")
     variance = height_noise(shape, double, steps)
-    value_y, slope_y = _seen(Line(shape[0], size, offset, smooth), double)
-    value_x, slope_x = _seen(Line(shape[1], size, offset, smooth), double)
+    value_y, slope_y = _seen(Line(shape[0], size, offsets[0], smooth), double)
+    value_x, slope_x = _seen(Line(shape[1], size, offsets[1], smooth), double)
     slope_x, slope_y = slope_x / steps[0], slope_y / steps[1]
     in_x = value_y.square() @ variance @ slope_x.square().mT
     in_y = slope_y.square() @ variance @ value_x.square().mT
