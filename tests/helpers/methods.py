@@ -136,7 +136,7 @@ METHODS: dict[str, Method] = {
         no={**ONE_DICTIONARY, "follows_flips": "the grid of the patches shifts to one side"},
         exact={
             "default": SLOPE_DLS_EXACT,
-            "quick": {**SLOPE_DLS_EXACT, "recipe": "quick"},
+            "quick": {**SLOPE_DLS_EXACT, "recipe": "quick", "guard": None},  # its blend by risk holds weights fixed
             "cosines": {**SLOPE_DLS_EXACT, "learn": False, "aggregate": "sparsity", "pixel_size": (0.5, 1.5)},
         },
     ),

@@ -8,7 +8,9 @@ from tests.helpers import DISK, random_field, seeded
 from torchdls import SURFACES, LeastSquares, SlopeDLS, add_noise, rmse, ssim
 from torchdls.integrators.slope_dls.bases import Places
 from torchdls.integrators.slope_dls.blend import least_in_simplex, signs, sure_weights
-from torchdls.integrators.slope_dls.runs import FOUR, Run, smooth
+from torchdls.integrators.slope_dls.known import Known
+from torchdls.integrators.slope_dls.lines import atoms
+from torchdls.integrators.slope_dls.runs import FOUR, HOLED, Run, smooth
 from torchdls.integrators.slope_dls.waves import cautious, shrink_slow_waves
 from torchdls.noise import height_noise
 from torchdls.operators import GradientOperator, dct2, idct2
@@ -17,34 +19,64 @@ from torchdls.surfaces import terrain
 
 STEPS = (0.8, 1.25)
 PLACES = [Places((13, 18), 8, 2), Places((21, 17), 17), Places((21, 18), 16, 3), Places((9, 6), 3), Places((1, 5), 1)]
+LONG = [Places((140, 29), 8, 3), Places((5, 131), 5, 1), Places((131, 150), 17, 0), Places((9, 300), 2)]
 
 
-@pytest.mark.parametrize("places", PLACES, ids=str)
+def coefficients_of(places, x):
+    return places.across(places.down(x))
+
+
+def heights_of(places, c):
+    return places.back_down(places.back_across(c))
+
+
+@pytest.mark.parametrize("places", PLACES + LONG, ids=str)
 def test_patches_are_orthonormal_and_cover_all(places):
-    x = random_field(2, 2, *places.shape)
-    c = places.analyse(x)
-    patches = places.patchwise(c)
-    rows, columns = places.positions
+    """Short axes go through dense matrices, long ones block by block; odd sides have three blocks."""
+    x, size = random_field(2, 2, *places.shape), places.size
+    c = coefficients_of(places, x)
+    rows, columns = (line.positions for line in places.lines)
+    basis = atoms(size, places.smooth, like=x)
+    torch.testing.assert_close(basis @ basis.mT, torch.eye(size, dtype=torch.float64))
+    count = torch.zeros(places.shape, dtype=torch.float64)
     for j, top in enumerate(rows):
         for i, left in enumerate(columns):
-            patch = x[..., top : top + places.size, left : left + places.size]
-            torch.testing.assert_close(patches[:, :, i, :, j].square().sum((-2, -1)), patch.square().sum((-2, -1)))
-    count = torch.zeros(places.shape, dtype=torch.float64)
-    for top in rows:
-        for left in columns:
-            count[top : top + places.size, left : left + places.size] += 1
+            patch = x[..., top : top + size, left : left + size]
+            torch.testing.assert_close(c[:, :, :, j, i], (basis @ patch @ basis.mT).movedim(-2, 0))
+            count[top : top + size, left : left + size] += 1
     assert count.min() > 0
-    torch.testing.assert_close(places.synthesise(c), x * count)
-    torch.testing.assert_close(places.spread(torch.ones_like(patches[..., 0, :, 0])), count.expand_as(x))
+    torch.testing.assert_close(heights_of(places, c), x * count)
+    torch.testing.assert_close(places.spread(torch.ones_like(c[0, ..., 0])), count.expand_as(x))
+    torch.testing.assert_close(places.coverage(x)[0, 0], count)
+
+
+@pytest.mark.parametrize("places", [PLACES[0], *LONG], ids=str)
+def test_sums_of_patches_are_the_transpose_of_cutting_them(places):
+    x = random_field(1, 2, *places.shape, seed=1)
+    c = random_field(*coefficients_of(places, x).shape, seed=2)
+    inner = (coefficients_of(places, x) * c).sum(), (x * heights_of(places, c)).sum()
+    torch.testing.assert_close(*inner)
+    weight = random_field(*c.shape[1:-1], seed=3)
+    ones = coefficients_of(places, torch.ones_like(x))
+    torch.testing.assert_close(places.spread(weight), heights_of(places, ones * weight[..., None]))
+
+
+def test_strips_are_parts_of_the_whole():
+    places, x = Places((140, 150), 8, 3), random_field(1, 2, 140, 150)
+    whole, noise, strips = coefficients_of(places, x), places.noise(x, STEPS), places.down(x)
+    slices = [slice(k, k + 5) for k in range(0, len(places.lines[0].positions), 5)]
+    parts = [places.across(strips[..., rows, :]) for rows in slices]
+    torch.testing.assert_close(torch.cat(parts, 3), whole)
+    torch.testing.assert_close(torch.cat([places.noise(x, STEPS, strips=rows) for rows in slices], 3), noise)
+    counted = [k for rows in Places((500, 600), 4).strips(3) for k in range(rows.start, rows.stop)]
+    assert counted == [*range(249)]
 
 
 def test_large_patches_hold_a_polynomial_in_few_coefficients():
     t = torch.linspace(-1, 1, 20, dtype=torch.float64)
     x = (1 - t[:, None] ** 2 + t**3 * t[:, None])[None, None].expand(1, 2, -1, -1)
-    places = Places((20, 20), 20)
-    assert (
-        places.analyse(x).abs() > 1e-10
-    ).sum() == 2 * 4  # 1, y^2, x y, x^3 y (as Legendre-like products) in each component
+    found = coefficients_of(Places((20, 20), 20), x)
+    assert (found.abs() > 1e-10).sum() == 2 * 4  # 1, y^2, x y, x^3 y (as Legendre-like products) in each component
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -57,7 +89,7 @@ def test_noise_of_every_coefficient_is_exact(places, turned):
     if turned:
         p, q = slopes.split(1, 1)
         slopes = torch.cat([p + q, p - q], 1) / 2**0.5
-    spread = places.analyse(slopes).square().sum(0).sqrt()
+    spread = coefficients_of(places, slopes).square().sum(1, keepdim=True).sqrt()
     torch.testing.assert_close(places.noise(g, STEPS, turned), spread, atol=1e-10, rtol=0)
 
 
@@ -65,26 +97,20 @@ def test_noise_of_every_coefficient_is_exact(places, turned):
 def test_in_large_images_patches_in_the_middle_share_their_noise(size):
     """Against the influence of every sample on one coefficient, by reverse differentiation of least squares."""
     places = Places((64, 330), size, 2)
-    noise = places.patchwise(places.noise(torch.empty(0, dtype=torch.float64), STEPS))
-    for i in (0, 1, len(places.positions[1]) // 2, len(places.positions[1]) - 1):
+    noise = places.noise(torch.empty(0, dtype=torch.float64), STEPS)
+    rows, columns = (line.positions for line in places.lines)
+    for i in (0, 1, len(columns) // 2, len(columns) - 1):
         g = torch.zeros(1, 2, 64, 330, dtype=torch.float64)
-        row, column = places.positions[0][0], places.positions[1][i]
-        atom = places.synthesise(_one(places, i, 1, 0))  # (1, 2, H, W): atom (0, 1) of a patch in the slopes in x
-        assert atom[..., row : row + size, column : column + size].square().sum() > 0.99
+        c = torch.zeros(size, 1, 2, len(rows), len(columns), size, dtype=torch.float64)
+        c[0, 0, 0, 0, i, 1] = 1
+        atom = heights_of(places, c)  # (1, 2, H, W): atom (0, 1) of a patch in the slopes in x
+        assert atom[..., rows[0] : rows[0] + size, columns[i] : columns[i] + size].square().sum() > 0.99
         a = GradientOperator("forward", STEPS)
         with torch.enable_grad():
             g.requires_grad_()
             seen = (extend_edges(a(LeastSquares(pixel_size=STEPS)(g)))[:, :1] * atom[:, :1]).sum()
             (influence,) = torch.autograd.grad(seen, g)  # linear: the variance is the energy of this
-        assert abs(float(noise[0, i, 1, 0, 0] / influence.norm()) - 1) < 0.03
-
-
-def _one(places, column, k, row):
-    """Coefficients that are 0 but for atom (0, k) of one patch of the first component."""
-    side = [len(p) * places.size for p in places.positions]
-    c = torch.zeros(1, 2, side[1], side[0], dtype=torch.float64)
-    places.patchwise(c)[0, 0, column, k, row, 0] = 1
-    return c
+        assert abs(float(noise[0, 0, 0, 0, i, 1] / influence.norm()) - 1) < 0.03
 
 
 @pytest.mark.parametrize("run", [*FOUR, Run(sizes=(3, 5), turned=True)], ids=range(5))
@@ -211,10 +237,96 @@ def test_a_batch_of_whole_and_holed_surfaces():
     mask = torch.cat([torch.ones(1, 1, 32, 32, dtype=torch.bool), DISK(32, 32)])
     result = SlopeDLS(n_iter=4, z_tol=1e-10).solve(gradient, mask)
     torch.testing.assert_close(result.height[:1], SlopeDLS(n_iter=4, z_tol=1e-10)(gradient[:1]))
-    holed = SlopeDLS(n_iter=4, z_tol=1e-10, recipe="plain").solve(gradient[1:], mask[1:])
-    torch.testing.assert_close(result.height[1:], holed.height)
-    torch.testing.assert_close(result.misfit[1:], holed.misfit)
-    assert SlopeDLS().solve(gradient, mask).misfit.shape == (2, 17)
+    holed = SlopeDLS(n_iter=4, z_tol=1e-10).solve(gradient[1:], mask[1:])
+    torch.testing.assert_close(result.height[1:], holed.height, atol=1e-7, rtol=0)
+    assert result.misfit.shape == (2, 5)
+    assert SlopeDLS.fast().solve(gradient, mask).misfit.shape == (2, 7)
+
+
+# Holes, weights, anchors
+
+
+def test_patches_know_what_lies_in_them():
+    places = Places((20, 31), 8, 3)
+    valid = (random_field(1, 2, 20, 31) > 0).double()
+    trust = random_field(1, 2, 20, 31, seed=1).exp()
+    known = Known(valid, trust)
+    weight, level = known.weight(places), known.level(places)
+    rows, columns = (line.positions for line in places.lines)
+    for j, top in enumerate(rows):
+        for i, left in enumerate(columns):
+            part = (..., slice(top, top + 8), slice(left, left + 8))
+            torch.testing.assert_close(weight[..., j, i], valid[part].mean((-2, -1)).square())
+            mean = (valid * trust)[part].sum((-2, -1)) / valid[part].sum((-2, -1))
+            torch.testing.assert_close(level[..., j, i], mean.rsqrt())
+    assert (Known(0 * valid, trust).level(places) == 1).all()
+
+
+def test_far_noise_is_that_of_the_middle_of_a_large_image():
+    for size, with_polynomials in ((8, False), (16, True)):
+        places, like = Places((160, 160), size, 0, with_polynomials), torch.empty(0, dtype=torch.float64)
+        middle = len(places.lines[0].positions) // 2
+        exact = places.noise(like, STEPS)[:, :, :, middle, middle]
+        torch.testing.assert_close(places.far_noise(like, STEPS)[:, :, :, 0, 0], exact, rtol=0.03, atol=0.05)
+
+
+def test_without_threshold_patches_of_holed_surfaces_code_everything():
+    slopes, valid = random_field(2, 2, 23, 31), torch.zeros(1, 2, 23, 31, dtype=torch.float64)
+    valid[..., 12:] = 1
+    coded = HOLED[0].code(slopes, torch.zeros(2, dtype=torch.float64), STEPS, 3, Known(valid, None))
+    torch.testing.assert_close(coded, slopes)  # measured, seen by a patch that knows, or left as they were
+
+
+@pytest.mark.parametrize("size, offset", [(8, 0), (8, 3), (17, 5), (64, 20)])
+def test_patches_of_a_window_are_those_of_the_whole(size, offset):
+    """Those that know nothing weigh nothing, so that a window around the others gives the same."""
+    slopes, valid = random_field(2, 2, 70, 160), torch.zeros(1, 2, 70, 160, dtype=torch.float64)
+    valid[..., 12:30, 60:131] = 1
+    places, known = Places((70, 160), size, offset), Known(valid, None)
+    noise = torch.full((2, 1, 1, 1), 0.8, dtype=torch.float64)
+    found = HOLED[0]._code(places, slopes, noise, STEPS, known)
+    far = places.far_noise(slopes, STEPS)
+    whole = HOLED[0]._code_patches(places, slopes, noise, lambda _: far, known.weight(places))
+    torch.testing.assert_close(found.total, whole.total)
+    torch.testing.assert_close(found.weight, whole.weight)
+    assert (found.weight == 0).any() or size == 64
+
+
+@pytest.mark.parametrize("recipe", ["blend", "quick"])
+def test_without_noise_holed_surfaces_are_least_squares(recipe):
+    surface = SURFACES["peaks"](32, dtype=torch.float64)
+    mask, method = DISK(32, 32), SlopeDLS(recipe=recipe, sigma=0.0)
+    plain = LeastSquares()(surface.gradient, mask)
+    torch.testing.assert_close(method(surface.gradient, mask), plain, atol=1e-4 * float(plain.abs().max()), rtol=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe, least", [("blend", 1.1), ("quick", 1.05)])
+def test_gain_over_least_squares_on_a_disk(recipe, least):
+    gains = []
+    for name in ("tent", "cone", "terrain"):
+        surface = terrain(64) if name == "terrain" else SURFACES[name](64)
+        gradient = torch.cat([add_noise(surface.gradient, 5, seeded(k)) for k in (10, 11)])
+        mask = DISK(64, 64)
+        truth = surface.height.expand(2, -1, -1, -1)
+        plain, found = LeastSquares()(gradient, mask), SlopeDLS(recipe=recipe)(gradient, mask)
+        gains.append(rmse(plain, truth, mask).mean() / rmse(found, truth, mask).mean())
+    assert min(gains) > 0.99
+    assert torch.stack(gains).log().mean().exp() > least
+
+
+def test_blend_by_a_probe_of_unequal_noise_takes_the_smooth_height():
+    """Half of the surface is four times as noisy; a plane under it is found better than by least squares."""
+    sigma = torch.full((1, 1, 40, 40), 0.1, dtype=torch.float64)
+    sigma[..., 20:] = 0.4
+    errors = []
+    for seed in range(3):
+        gradient = 0.3 + sigma * random_field(1, 2, 40, 40, seed=seed)
+        weight = 1 / sigma.square()
+        truth = LeastSquares()(torch.full_like(gradient, 0.3))
+        errors.append([rmse(m(gradient, weight=weight), truth) for m in (LeastSquares(), SlopeDLS())])
+    plain, found = torch.tensor(errors).mean(0)
+    assert found < 0.8 * plain
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 1)])

@@ -2,38 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
+from torchdls.integrators.slope_dls.lines import Line, atoms, inside
 from torchdls.noise import height_noise
 from torchdls.operators.cosine import cosine_matrix
 from torchdls.operators.tables import table
 
 _GOLDEN = 0.381966  # of a stride: the shifts of the patch grid from one iteration to the next, never in step
-_SMOOTH_FROM = 16  # pixels: smaller patches have too few atoms to spend six on polynomials
-_DEGREE = 5
 _EXACT = 192  # pixels: along longer sides the patches in the middle share their noise
+_AT_ONCE = 1 << 18  # coefficients that are held at a time: they stay in the cache
 
 
 @dataclass(frozen=True)
 class Places:
     """Square patches of one size on a grid of half their side, clipped into the image.
 
-    Coefficients stand as (N, C, W', H'), W' = columns of patches x size: transposed, patch after patch.
+    Patches in a row share the transform of their columns: `down` transforms the columns of strips of rows, once for
+    the whole strip, and `across` goes on from there, a few strips at a time. Coefficients stand as
+    (size, N, C, rows of patches, columns of patches, size).
 
     Args:
         shape: (H, W) of the image.
         size: side of a patch, at most min(H, W).
-        offset: rows and columns by which the grid starts before the image.
+        offset: rows and columns by which the grid starts before the image, one number or one for each.
         smooth: bases of patches from 16 pixels on begin with polynomials.
     """
 
     shape: tuple[int, int]
     size: int
-    offset: int = 0
+    offset: int | tuple[int, int] = 0
     smooth: bool = True
 
     @classmethod
@@ -42,35 +46,76 @@ class Places:
         stride = max(1, size // 2)
         return cls(shape, size, round(iteration * _GOLDEN * stride) % stride, smooth)
 
+    @property
+    def offsets(self) -> tuple[int, int]:
+        """Of rows and columns."""
+        return (self.offset, self.offset) if isinstance(self.offset, int) else self.offset
+
     @cached_property
-    def positions(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """First rows and first columns of the patches."""
-        rows, columns = (_positions(n, self.size, self.offset) for n in self.shape)
-        return rows, columns
+    def lines(self) -> tuple[Line, Line]:
+        """The segments of the rows and the columns."""
+        (h, w), (down, across) = self.shape, self.offsets
+        return Line(h, self.size, down, self.smooth), Line(w, self.size, across, self.smooth)
 
-    def analyse(self, x: Tensor) -> Tensor:
-        """(N, C, H, W) -> coefficients of all patches."""
-        rows, columns = self.positions
-        return self._forward(self._forward(x, columns).mT, rows)
+    def within(self, live: Tensor) -> tuple[Places, tuple[slice, slice], tuple[slice, slice]]:
+        """The same patches on the smallest window that holds the live ones.
 
-    def synthesise(self, coefficients: Tensor) -> Tensor:
-        """Sum of the patches that the coefficients describe, (N, C, H, W): the transpose of `analyse`."""
-        (rows, columns), (h, w) = self.positions, self.shape
-        return self._backward(self._backward(coefficients, rows, h).mT, columns, w)
+        Args:
+            live: (rows, columns) bool of patches.
+
+        Returns:
+            The patches of the window, its rows and columns of pixels, and those of its patches.
+        """
+        pixels, patches, offsets = [], [], []
+        for line, dim, offset in zip(self.lines, (1, 0), self.offsets, strict=True):
+            alive = live.any(dim).nonzero().flatten()
+            first, last = (int(alive[0]), int(alive[-1])) if len(alive) else (0, 0)
+            patches.append(slice(first, last + 1))
+            pixels.append(slice(line.positions[first], line.positions[last] + self.size))
+            offsets.append(0 if first else offset)
+        (rows, columns), (down, across) = pixels, offsets
+        shape = (rows.stop - rows.start, columns.stop - columns.start)
+        part = Places(shape, self.size, (down, across), self.smooth)
+        return part, (rows, columns), (patches[0], patches[1])
+
+    def strips(self, surfaces: int) -> Iterator[slice]:
+        """Rows of patches, as many at a time as are to be held for so many surfaces of two components."""
+        rows, columns = (len(line.positions) for line in self.lines)
+        step = max(1, _AT_ONCE // (2 * surfaces * columns * self.size**2))
+        return (slice(k, min(k + step, rows)) for k in range(0, rows, step))
+
+    def down(self, x: Tensor) -> Tensor:
+        """(N, C, H, W) -> (size, N, C, rows of patches, W): the columns of all strips transformed."""
+        return self.lines[0].rows(x)
+
+    def across(self, strips: Tensor) -> Tensor:
+        """(size, N, C, P, W) -> (size, N, C, P, columns of patches, size): coefficients of the patches of strips."""
+        return self.lines[1].columns(strips)
+
+    def back_across(self, coefficients: Tensor) -> Tensor:
+        """The transpose of `across`."""
+        return self.lines[1].lay_columns(coefficients)
+
+    def back_down(self, strips: Tensor) -> Tensor:
+        """The transpose of `down`."""
+        return self.lines[0].lay_rows(strips)
 
     def spread(self, weight: Tensor) -> Tensor:
-        """Sums (N, C, H, W) over the patches of one number for each, (N, C, columns, rows) of patches."""
-        rows, columns = (_inside(n, self.size, p, like=weight) for n, p in zip(self.shape, self.positions, strict=True))
-        return (columns.mT @ weight @ rows).mT
+        """Sums (N, C, H, W) over the patches of one number for each, (N, C, rows, columns) of patches."""
+        rows, columns = self.lines
+        return rows.spread(columns.spread(weight).mT).mT
 
-    def patchwise(self, coefficients: Tensor) -> Tensor:
-        """Coefficients as (N, C, columns of patches, size, rows of patches, size)."""
-        return coefficients.unflatten(-1, (-1, self.size)).unflatten(-3, (-1, self.size))
+    def coverage(self, like: Tensor) -> Tensor:
+        """(1, 1, H, W), the number of patches over each pixel."""
+        rows, columns = (inside(line, like=like).sum(0) for line in self.lines)
+        return (rows[:, None] * columns)[None, None]
 
-    def noise(self, like: Tensor, steps: tuple[float, float], turned: bool = False) -> Tensor:
+    def noise(
+        self, like: Tensor, steps: tuple[float, float], turned: bool = False, strips: slice = slice(None)
+    ) -> Tensor:
         r"""Standard deviation of every coefficient of the projected slopes at its place, for white noise of level 1.
 
-            var c_x = F_a S F_d^T / dx^2,   var c_y = F_d S F_a^T / dy^2
+            var c_x = F_d S F_a^T / dx^2,   var c_y = F_a S F_d^T / dy^2
             F_a = (T M^T)^2,   F_d = (T E M^T)^2   elementwise
 
         T has an atom of a patch in every row, placed in the image; M is the cosine matrix, E the difference of
@@ -81,111 +126,76 @@ class Places:
             like: a tensor of the wanted dtype and device.
             steps: (dx, dy).
             turned: for the slopes along the diagonals, (p + q, p - q) / sqrt 2, in the place of p and q.
+            strips: rows of patches.
 
         Returns:
-            (2, W', H').
+            (size, 1, 2, rows of patches, columns of patches, size).
         """
-        (h, rows), (w, columns) = (_less(n, self.size, self.offset) for n in self.shape)
-        found: Tensor = _noise((h, w), self.size, self.offset, self.smooth, tuple(steps), turned, like=like)
-        if (h, w) == self.shape:
-            return found
-        by_patch = found.unflatten(-1, (-1, self.size)).unflatten(-3, (-1, self.size))
-        down, across = (torch.tensor(k, device=like.device) for k in (rows, columns))
-        return by_patch.index_select(1, across).index_select(3, down).flatten(1, 2).flatten(2)
+        (h, spared), (w, out) = (_less(line) for line in self.lines)
+        rows, columns = self.lines
+        found: Tensor = _noise((h, w), self.size, self.offsets, self.smooth, tuple(steps), turned, like=like)
+        found = _prolonged(found, 3, spared, *strips.indices(len(rows.positions))[:2])
+        return _prolonged(found, 4, out, 0, len(columns.positions))
 
-    def _forward(self, x: Tensor, positions: tuple[int, ...]) -> Tensor:
-        index, atoms = _samples(self.size, positions, like=x), _atoms(self.size, self.smooth, like=x)
-        return (x.index_select(-1, index).unflatten(-1, (-1, self.size)) @ atoms.mT).flatten(-2)
-
-    def _backward(self, c: Tensor, positions: tuple[int, ...], n: int) -> Tensor:
-        atoms = _atoms(self.size, self.smooth, like=c)
-        patches = (c.unflatten(-1, (-1, self.size)) @ atoms).flatten(-2)
-        if len(positions) == 1:
-            return patches
-        index = _owners(n, self.size, positions, like=c)
-        return torch.nn.functional.pad(patches, (0, 1)).index_select(-1, index).unflatten(-1, (-1, n)).sum(-2)
-
-
-def _positions(n: int, size: int, offset: int) -> tuple[int, ...]:
-    stride = max(1, size // 2)
-    steps = range(-(-(n - size + offset) // stride) + 1)
-    return tuple(sorted({min(max(0, k * stride - offset), n - size) for k in steps}))
-
-
-def _less(n: int, size: int, offset: int) -> tuple[int, list[int]]:
-    """A side that is shorter by whole strides, and the patch of it that stands for each patch of the whole side."""
-    stride = max(1, size // 2)
-    left_out = max(0, n - max(_EXACT, 4 * size)) // stride
-    less = n - left_out * stride
-    count = len(_positions(less, size, offset))
-    half = count // 2
-    return less, [*range(half), *[half] * left_out, *range(half, count)]
+    def far_noise(self, like: Tensor, steps: tuple[float, float]) -> Tensor:
+        """`noise` of a patch far from every border, (size, 1, 2, 1, 1, size)."""
+        found: Tensor = _far_noise(self.size, self.smooth, tuple(steps), like=like)
+        return found
 
 
 @table
-def _samples(size: int, positions: tuple[int, ...]) -> Tensor:
-    """(patches x size,) the sample that each entry of a patch is."""
-    return (torch.tensor(positions, device="cpu")[:, None] + torch.arange(size, device="cpu")).flatten()
+def _far_noise(size: int, smooth: bool, steps: tuple[float, float]) -> Tensor:
+    middle = Places((4 * size, 4 * size), size, 0, smooth)
+    found = middle.noise(torch.empty(0, dtype=torch.float64, device="cpu"), steps)
+    row, column = (len(line.positions) // 2 for line in middle.lines)
+    return found[..., row : row + 1, column : column + 1, :].contiguous()
 
 
-def _owners_build(n: int, size: int, positions: tuple[int, ...]) -> Tensor:
-    """(most x n,) the entries of patches that lie on each sample, filled up with the entry after the last."""
-    found: list[list[int]] = [[] for _ in range(n)]
-    for k, p in enumerate(positions):
-        for i in range(size):
-            found[p + i].append(k * size + i)
-    most, none = max(map(len, found)), len(positions) * size
-    return torch.tensor([[f[j] if j < len(f) else none for f in found] for j in range(most)], device="cpu").flatten()
+def _less(line: Line) -> tuple[int, int]:
+    """A side that is shorter by whole strides, and the number of these; it has so many patches fewer in the middle."""
+    spared = max(0, line.n - max(_EXACT, 4 * line.size)) // line.stride
+    return line.n - spared * line.stride, spared
 
 
-@table
-def _inside(n: int, size: int, positions: tuple[int, ...]) -> Tensor:
-    """(patches, n) 1 inside the patch."""
-    k = torch.arange(n, device="cpu") - torch.tensor(positions, device="cpu")[:, None]
-    return ((k >= 0) & (k < size)).double()
-
-
-@table
-def _atoms(size: int, smooth: bool) -> Tensor:
-    """(size, size) orthonormal rows: cosines, from 16 pixels on after polynomials of degree 0 to 5 (Gram-Schmidt)."""
-    cosines = cosine_matrix(size, like=torch.empty(0, dtype=torch.float64, device="cpu"))
-    if not smooth or size < _SMOOTH_FROM:
-        return cosines
-    t = torch.linspace(-1, 1, size, dtype=torch.float64, device="cpu")
-    powers = torch.stack([t**k for k in range(_DEGREE + 1)])
-    q, r = torch.linalg.qr(torch.cat([powers, cosines[1 : size - _DEGREE]]).mT)
-    return (q * r.diagonal().sign()).mT.contiguous()
+def _prolonged(x: Tensor, dim: int, spared: int, start: int, end: int) -> Tensor:
+    """Entries start to end along a dimension of which the one in the middle stands for `spared` more."""
+    if not spared:
+        return x.narrow(dim, start, end - start)
+    middle = x.shape[dim] // 2
+    ends = [min(max(start, k), end) for k in (start, middle, middle + spared + 1, end)]
+    before, same, after = (b - a for a, b in pairwise(ends))
+    parts = [x.narrow(dim, start, before)] if before else []
+    parts += [x.narrow(dim, middle, 1).expand(*x.shape[:dim], same, *x.shape[dim + 1 :])] if same else []
+    parts += [x.narrow(dim, ends[2] - spared, after)] if after else []
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim)
 
 
 def _build_noise(
-    shape: tuple[int, int], size: int, offset: int, smooth: bool, steps: tuple[float, float], turned: bool
+    shape: tuple[int, int], size: int, offsets: tuple[int, int], smooth: bool, steps: tuple[float, float], turned: bool
 ) -> Tensor:
     double = torch.empty(0, dtype=torch.float64, device="cpu")
-    variance = height_noise(shape, double, steps).mT
-    value_y, slope_y = _seen(shape[0], size, offset, smooth, double)
-    value_x, slope_x = _seen(shape[1], size, offset, smooth, double)
+    variance = height_noise(shape, double, steps)
+    value_y, slope_y = _seen(Line(shape[0], size, offsets[0], smooth), double)
+    value_x, slope_x = _seen(Line(shape[1], size, offsets[1], smooth), double)
     slope_x, slope_y = slope_x / steps[0], slope_y / steps[1]
-    in_x = slope_x.square() @ variance @ value_y.square().mT
-    in_y = value_x.square() @ variance @ slope_y.square().mT
+    in_x = value_y.square() @ variance @ slope_x.square().mT
+    in_y = slope_y.square() @ variance @ value_x.square().mT
     if turned:
-        shared, mean = (slope_x * value_x) @ variance @ (slope_y * value_y).mT, (in_x + in_y) / 2
+        shared, mean = (slope_y * value_y) @ variance @ (slope_x * value_x).mT, (in_x + in_y) / 2
         in_x, in_y = mean + shared, mean - shared
-    return torch.stack([in_x, in_y]).clamp(min=0).sqrt()
+    by_patch = torch.stack([in_x, in_y]).clamp(min=0).sqrt().unflatten(-1, (-1, size)).unflatten(-3, (-1, size))
+    return by_patch.movedim(2, 0)[:, None].contiguous()
 
 
-def _seen(n: int, size: int, offset: int, smooth: bool, double: Tensor) -> tuple[Tensor, Tensor]:
+def _seen(line: Line, double: Tensor) -> tuple[Tensor, Tensor]:
     """What each placed atom sees of each cosine mode, and of its differences: T M^T and T E M^T."""
-    positions, atoms, modes = (
-        _positions(n, size, offset),
-        _atoms(size, smooth, like=double),
-        cosine_matrix(n, like=double),
-    )
+    n, size = line.n, line.size
+    basis, modes = atoms(size, line.smooth, like=double), cosine_matrix(n, like=double)
     difference = modes.diff(dim=1)
     last = difference[:, -1:] if n > 1 else torch.zeros_like(modes)
     difference = torch.cat([difference, last], 1)
-    value, slope = (torch.cat([atoms @ m[:, p : p + size].mT for p in positions]) for m in (modes, difference))
+    value, slope = (torch.cat([basis @ m[:, p : p + size].mT for p in line.positions]) for m in (modes, difference))
     return value, slope
 
 
-_owners = table(_owners_build)
 _noise = table(_build_noise, maxsize=160)

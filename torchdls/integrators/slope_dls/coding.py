@@ -26,12 +26,14 @@ class Noise(NamedTuple):
     Attributes:
         level: (N,) for a trust of 1.
         trust: (N, 2, H, W) relative inverse variance on the edges, or None for 1 everywhere.
+        pixels: (N, 1 or 2, H, W) the same of the samples, likewise.
         overall: (N,) for the largest trust of a surface, which is the trust of all samples where it is `even`.
         even: (N, 1, 1, 1) bool: whether the surface is a full rectangle with one trust everywhere and no anchor.
     """
 
     level: Tensor
     trust: Tensor | None
+    pixels: Tensor | None
     overall: Tensor
     even: Tensor
 
@@ -137,12 +139,15 @@ class SlopeScale:
         return torch.block_diag(d, d).expand(slopes.shape[0], -1, -1)
 
 
-def average(parts: Sequence[Coded]) -> Tensor:
-    """(N, 2, H, W): the weighted mean of all estimates of all patches."""
+def average(parts: Sequence[Coded], otherwise: Tensor | None = None) -> Tensor:
+    """(N, 2, H, W): the weighted mean of all estimates of all patches, and another field where no weight is."""
     total, weight = parts[0]
     for part in parts[1:]:
         total, weight = total + part.total, weight + part.weight
-    return total / weight
+    if otherwise is None:
+        return total / weight
+    some = weight > 0
+    return torch.where(some, total / torch.where(some, weight, 1), otherwise)
 
 
 def _separable(patches: Tensor, down: Tensor, across: Tensor) -> Tensor:

@@ -15,18 +15,17 @@ from torchdls.integrators.data_term import Quadratic
 from torchdls.integrators.fields import has_even_trust, largest_per_surface
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.slope_dls.coding import Aggregate, Noise, SlopeScale, average
+from torchdls.integrators.slope_dls.holed import continued, smooth_holed
 from torchdls.integrators.slope_dls.outliers import replace_outliers
-from torchdls.integrators.slope_dls.runs import FOUR, QUICK, Run, smooth
+from torchdls.integrators.slope_dls.runs import FOUR, HOLED, HOLED_QUICK, KAPPA, QUICK, Run, smooth
 from torchdls.noise import noise_if_told
 from torchdls.operators import GradientOperator, edge_slopes
-from torchdls.operators.edges import edge_ends, extend_edges
+from torchdls.operators.edges import extend_edges
 from torchdls.selection import discrepancy_guard, probe, sure_guard
-from torchdls.solvers import harmonic_extension, solve
+from torchdls.solvers import solve
 
 Guard = Literal["discrepancy", "sure"]
 Recipe = Literal["blend", "quick", "plain"]
-
-_KAPPA = 25.0  # trust in the coded slopes, as a multiple of that in the measured ones
 
 
 class SlopeDLSResult(NamedTuple):
@@ -68,7 +67,7 @@ class SlopeDLSResult(NamedTuple):
 
 @dataclass(frozen=True)
 class _Plain:
-    """Settings of the recipe "plain", which also serves surfaces with holes, unequal weights or anchors."""
+    """Settings of the recipe "plain"."""
 
     patch_sizes: tuple[int, ...] = (8, 24, 48)
     tau: float = 0.8
@@ -77,7 +76,7 @@ class _Plain:
     aggregate: Aggregate = "mean"
 
 
-_PLAIN = {"blend": _Plain(), "plain": _Plain(), "quick": _Plain((8, 16, 32), 2.7, 1, False, "sparsity")}
+_HOLED: dict[str, tuple[Run, ...]] = {"blend": HOLED, "quick": HOLED_QUICK}
 _RUNS: dict[str, tuple[Run, ...]] = {"blend": FOUR, "quick": QUICK, "plain": ()}
 
 
@@ -102,15 +101,17 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
     patches alone), and blends the four heights by Stein's unbiased risk estimate from a second round on probed data.
     At last, cosine modes of the height of periods above 32 pixels, which patches hardly see, are shrunk
     (`shrink_slow_waves`), and where little of the noise was found, as on texture, least squares is returned
-    (`cautious`). "quick" is one run of 6 iterations with
-    equal weights, about a tenth of the work.
+    (`cautious`). "quick" is one run of 6 iterations with equal weights, about a tenth of the work.
+
+    Surfaces with a mask, unequal weights or anchors go through one run with equal weights ("quick": of 4 iterations).
+    Slopes outside the mask are filled by the last estimate u (at first by those of the harmonic extension). Patches
+    weigh by the square of the share of slopes that they know, and their noise is that far from every border; weights
+    are inverse relative variances, and each patch is coded in units of its own noise. Step 4 and the slow waves are
+    left out; the run is blended with least squares by its risk, which a probe tells there too.
 
     "plain" codes sizes 8, 24, 48 with one threshold, from the noise that atoms see far from the border; patches of the
-    smallest size hold both components and go through one sweep of SOUP-DIL, which learns their dictionary. It also
-    serves the surfaces of a batch with holes, unequal weights or anchors, whatever the recipe, since there the noise
-    of the height is not known exactly; step 4 then is left out. With a mask, slopes outside are filled by the last
-    estimate u (at first by those of the harmonic extension). Weights are inverse relative variances: each patch is
-    coded in units of its own noise.
+    smallest size hold both components and go through one sweep of SOUP-DIL, which learns their dictionary. With a
+    mask, weights or anchors step 4 is left out.
 
     Differentiable by unrolling, with choices held fixed: the supports of the codes, the weights of the blend, the
     shares of the thresholds of slow waves and of least squares. Heights, weights and thresholds refer to heights in
@@ -168,7 +169,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(pixel_size=pixel_size)
-        if recipe not in _PLAIN:
+        if recipe not in _RUNS:
             raise ValueError(f"SlopeDLS: recipe={recipe!r} given; choose from 'blend', 'quick', 'plain'")
         self.patch_sizes = None if patch_sizes is None else tuple(patch_sizes)
         sizes = (8,) if self.patch_sizes is None else self.patch_sizes
@@ -192,7 +193,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
 
     @classmethod
     def fast(cls, **options: Any) -> Self:
-        """The recipe "quick"; with a mask, weights or anchors one pass over sizes 8, 16, 32 by cosines.
+        """The recipe "quick".
 
         Args:
             options: of the class, in the place of those of the variant.
@@ -204,8 +205,8 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         names = ("patch_sizes", "tau", "n_iter", "learn", "aggregate")
         return {name: value for name in names if (value := getattr(self, name)) is not None}
 
-    def _runs(self) -> list[Run]:
-        """The runs of the recipe with the options given."""
+    def _runs(self, runs: Sequence[Run]) -> list[Run]:
+        """Runs with the options given."""
         given: dict[str, Any] = {}
         if self.patch_sizes is not None:
             given |= {"sizes": self.patch_sizes, "whole": False}
@@ -213,7 +214,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
             given["tau"] = (self.tau, self.tau)
         if self.n_iter is not None:
             given["n_iter"] = self.n_iter
-        return [replace(run, **given) for run in _RUNS[self.recipe]]
+        return [replace(run, **given) for run in runs]
 
     def _in_units(self, result: SlopeDLSResult) -> SlopeDLSResult:
         """The height in the unit of `pixel_size`; slopes and their codes have none."""
@@ -234,20 +235,22 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         return result._replace(confidence=trusted.expand(noise.level.shape[0], -1, -1, -1))
 
     def _smooth(self, fields: Fields, noise: Noise, callback: Callback | None = None) -> SlopeDLSResult:
-        """Each surface by the recipe or, where the noise of its height is not known exactly, plainly."""
+        """Each surface by the runs of the recipe for full rectangles with equal trust, or by those for others."""
         bare = fields.mask is None and fields.anchor_weight is None and noise.trust is None
         known = bare or is_concrete(noise.even)
-        if self.recipe == "plain" or (known and not bare and not bool(noise.even.any())):
+        if self.recipe == "plain":
             return self._plain(fields, noise, callback)
+        if known and not bare and not bool(noise.even.any()):
+            return self._holed(fields, noise, callback)
         exact = self._exact(fields, noise, callback)
         if bare or (known and bool(noise.even.all())):
             return exact
-        plain = self._plain(fields, noise)
-        length = max(exact.misfit.shape[1], plain.misfit.shape[1])
-        return plain._replace(
-            height=torch.where(noise.even, exact.height, plain.height),
+        holed = self._holed(fields, noise)
+        length = max(exact.misfit.shape[1], holed.misfit.shape[1])
+        return exact._replace(
+            height=torch.where(noise.even, exact.height, holed.height),
             misfit=torch.where(
-                noise.even[:, :, 0, 0], _lengthened(exact.misfit, length), _lengthened(plain.misfit, length)
+                noise.even[:, :, 0, 0], _lengthened(exact.misfit, length), _lengthened(holed.misfit, length)
             ),
         )
 
@@ -263,16 +266,16 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
                 callback(len(misfit) - 1, misfit[-1].detach())
 
         guarded = self.guard is not None
-        height = smooth(self._runs(), fields.gradient, noise.overall, fields.steps, guarded, watch)
+        height = smooth(self._runs(_RUNS[self.recipe]), fields.gradient, noise.overall, fields.steps, guarded, watch)
         return SlopeDLSResult(height, None, None, torch.stack(misfit, 1), noise.level, height)
 
     def _plain(self, fields: Fields, noise: Noise, callback: Callback | None = None) -> SlopeDLSResult:
-        recipe = replace(_PLAIN[self.recipe], **self._given())
+        recipe = replace(_Plain(), **self._given())
         a = GradientOperator("forward", fields.steps)
         data = Quadratic.of(fields)
         v, w, _ = data
         z = start = self._height(fields, v, w, None)
-        valid, coded = _continue(fields, z, w, self.z_tol)
+        valid, coded = continued(z, w, fields.steps, self.z_tol)
         scales = _scales(fields, recipe.patch_sizes)
         D = scales[0].initial_dictionary(v) if recipe.learn else None
         B: Tensor | None = None
@@ -288,13 +291,28 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
                     part = scale.shifted(iteration).code_cosines(slopes, noise, recipe.tau, recipe.aggregate)
                 parts.append(part)
             coded = average(parts)
-            z = self._height(fields, (v + _KAPPA * coded) / (1 + _KAPPA), w, z)
+            z = self._height(fields, (v + KAPPA * coded) / (1 + KAPPA), w, z)
             if self.guard is not None:
                 z = torch.where(noise.even, discrepancy_guard(z, start, noise.overall, fields.steps), z)
             misfit.append(data.cost(z))
             if callback is not None:
                 callback(iteration + 1, misfit[-1].detach())
         return SlopeDLSResult(z, D, B, torch.stack(misfit, 1), noise.level, z)
+
+    def _holed(self, fields: Fields, noise: Noise, callback: Callback | None = None) -> SlopeDLSResult:
+        """By the runs of the recipe for holes, unequal weights or anchors."""
+        data = Quadratic.of(fields)
+        v, w, _ = data
+        misfit: list[Tensor] = []
+
+        def watch(z: Tensor) -> None:
+            misfit.append(data.cost(z))
+            if callback is not None and len(misfit) > 1:
+                callback(len(misfit) - 1, misfit[-1].detach())
+
+        runs = self._runs(_HOLED[self.recipe])
+        height = smooth_holed(runs, fields, noise, self.z_tol, self.guard is not None, watch)
+        return SlopeDLSResult(height, None, None, torch.stack(misfit, 1), noise.level, height)
 
     def _height(self, fields: Fields, v: Tensor, w: Tensor | None, z0: Tensor | None) -> Tensor:
         guess = None if z0 is None else z0.detach()
@@ -316,7 +334,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
             level = level.reshape(-1).expand(n)
         trust = None if weight is None else edge_slopes(gradient, fields.mask, weight)[1]
         overall = level if weight is None else level * largest_per_surface(weight).flatten().clamp(min=1e-30).rsqrt()
-        return Noise(level, trust, overall, has_even_trust(fields, weight))
+        return Noise(level, trust, weight, overall, has_even_trust(fields, weight))
 
     def _from_map(self, sigma: Tensor, fields: Fields) -> tuple[Tensor, Tensor]:
         """Weights and level of a noise map: its root mean square is the level."""
@@ -336,16 +354,6 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         start, moved = (self._height(f, *Quadratic.of(f)[:2], None) for f in (fields, fields._replace(gradient=n)))
         change = (self._smooth(probed, noise).height - z) / step
         return torch.where(noise.even, sure_guard(z, start, change, moved, noise.overall), z)
-
-
-def _continue(fields: Fields, z: Tensor, w: Tensor | None, tol: float) -> tuple[Tensor | None, Tensor]:
-    """The edges whose slopes are measured, and slopes for the others: those of the harmonic extension."""
-    if w is None:
-        return None, z
-    held = edge_ends(w) > 0
-    if not is_concrete(held) or not bool(held.all()):
-        z = harmonic_extension(z, held, tol=tol, pixel_size=fields.steps)
-    return extend_edges(w) > 0, extend_edges(GradientOperator("forward", fields.steps)(z))
 
 
 def _scales(fields: Fields, patch_sizes: tuple[int, ...]) -> list[SlopeScale]:

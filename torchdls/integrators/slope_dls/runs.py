@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
+from torchdls._tracing import is_concrete
 from torchdls.integrators.slope_dls.bases import Places
 from torchdls.integrators.slope_dls.blend import signs, sure_weights
 from torchdls.integrators.slope_dls.coding import Coded, average
+from torchdls.integrators.slope_dls.known import Known
 from torchdls.integrators.slope_dls.waves import cautious, shrink_slow_waves
 from torchdls.operators import GradientOperator, edge_slopes
 from torchdls.operators.edges import extend_edges
@@ -20,7 +23,7 @@ from torchdls.selection import discrepancy_guard
 from torchdls.solvers import solve
 
 _PERIODS = (24.0, 32.0)  # pixels: the waves to shrink are longer, after one run and after a blend
-_KAPPA = 25.0  # trust in the coded slopes, as a multiple of that in the measured ones
+KAPPA = 25.0  # trust in the coded slopes, as a multiple of that in the measured ones
 
 
 @dataclass(frozen=True)
@@ -74,34 +77,85 @@ class Run:
         v, a, z = edge_slopes(gradient)[0], GradientOperator("forward", steps), start
         for iteration in range(self.n_iter):
             coded = self.code(extend_edges(a(z)), noise, steps, iteration)
-            z = solve((v + _KAPPA * coded) / (1 + _KAPPA), pixel_size=steps).height
+            z = solve((v + KAPPA * coded) / (1 + KAPPA), pixel_size=steps).height
             z = discrepancy_guard(z, start, noise, steps) if guard else z
             yield z
 
-    def code(self, slopes: Tensor, noise: Tensor, steps: tuple[float, float], iteration: int) -> Tensor:
-        """The mean of all estimates of all patches, (N, 2, H, W)."""
+    def code(
+        self,
+        slopes: Tensor,
+        noise: Tensor,
+        steps: tuple[float, float],
+        iteration: int,
+        known: Known | None = None,
+    ) -> Tensor:
+        """The mean of all estimates of all patches, (N, 2, H, W).
+
+        Args:
+            slopes: (N, 2, H, W).
+            noise: (N,) standard deviation of one gradient sample.
+            steps: (dx, dy).
+            iteration: from 0.
+            known: where the slopes are measured; the noise then is that far from every border, and a patch weighs as
+                much as it knows. Where no patch knows anything the slopes come back as they are. None: a full
+                rectangle with equal trust.
+        """
         tau, shape = self.threshold(iteration), (slopes.shape[-2], slopes.shape[-1])
-        slopes = _turn(slopes) if self.turned else slopes
+        given, slopes = slopes, _turn(slopes) if self.turned else slopes
         parts = []
         for places in self.places(shape, iteration):
-            part = self._code(places, slopes, tau * noise[:, None, None, None], steps)
+            part = self._code(places, slopes, tau * noise[:, None, None, None], steps, known)
             if self.turned:  # turning back mixes the two components, so they must share one weight
                 weight = part.weight.mean(1, keepdim=True)
                 part = Coded(_turn(part.total / part.weight) * weight, weight)
             parts.append(part)
-        return average(parts)
+        return average(parts) if known is None else average(parts, given)
 
-    def _code(self, places: Places, slopes: Tensor, level: Tensor, steps: tuple[float, float]) -> Coded:
-        coefficients = places.analyse(slopes)
-        kept = coefficients.abs() > level * places.noise(slopes, steps, self.turned)
-        coefficients = torch.where(kept, coefficients, 0)
+    def _code(
+        self, places: Places, slopes: Tensor, level: Tensor, steps: tuple[float, float], known: Known | None
+    ) -> Coded:
+        if known is None:
+            return self._code_patches(
+                places, slopes, level, lambda rows: places.noise(slopes, steps, self.turned, rows)
+            )
+        far, trust, level = places.far_noise(slopes, steps), known.weight(places), level * known.level(places)
+        if not is_concrete(trust):
+            return self._code_patches(places, slopes, level, lambda _: far, trust)
+        part, (down, across), at = places.within((trust > 0).any(0).any(0))
+        level = level[:, :, at[0], at[1]] if level.shape[2] > 1 else level
+        coded = self._code_patches(part, slopes[..., down, across], level, lambda _: far, trust[:, :, at[0], at[1]])
+        (h, w), (top, left) = places.shape, (down.start, across.start)
+        return Coded(*(functional.pad(x, (left, w - across.stop, top, h - down.stop)) for x in coded))
+
+    def _code_patches(
+        self,
+        places: Places,
+        slopes: Tensor,
+        level: Tensor,
+        noise: Callable[[slice], Tensor],
+        trust: Tensor | None = None,
+    ) -> Coded:
+        strips, totals, weights = places.down(slopes), [], []
+        for rows in places.strips(len(slopes)):
+            coefficients = places.across(strips[..., rows, :])
+            own = level[:, :, rows] if level.shape[2] > 1 else level
+            limit = (own[..., None] * noise(rows)).detach()
+            kept = (coefficients.detach().abs() - limit).relu().sign()  # 1 above the threshold, else 0
+            coefficients = coefficients * kept
+            weight = self._weight(places.size, kept, None if trust is None else trust[:, :, rows])
+            if weight is not None:
+                weights.append(weight)
+                coefficients = coefficients * weight[..., None]
+            totals.append(places.back_across(coefficients))
+        total = places.back_down(torch.cat(totals, -2))
+        return Coded(total, places.spread(torch.cat(weights, 2)) if weights else places.coverage(slopes))
+
+    def _weight(self, size: int, kept: Tensor, trust: Tensor | None) -> Tensor | None:
+        """(N, 2, rows, columns) of patches in the average; None for 1."""
         if self.weights == "equal":
-            one = torch.ones_like(places.patchwise(coefficients)[:1, :1, :, 0, :, 0])
-            return Coded(places.synthesise(coefficients), places.spread(one))
-        count = places.patchwise(kept).sum((-3, -1))
-        weight = (places.size**2 if self.weights == "size" else 1) / (1 + count).to(slopes.dtype)
-        weighted = (places.patchwise(coefficients) * weight[..., :, None, :, None]).view_as(coefficients)
-        return Coded(places.synthesise(weighted), places.spread(weight))
+            return trust
+        weight = (size**2 if self.weights == "size" else 1) / (1 + kept.sum(0).sum(-1))
+        return weight if trust is None else weight * trust
 
 
 FOUR = (
@@ -111,6 +165,8 @@ FOUR = (
     Run(sizes=(4, 8, 16), whole=False, weights="count", smooth=False),
 )
 QUICK = (Run(sizes=(8, 16, 32, 64), tau=(1.8, 0.3), weights="equal", n_iter=6),)
+HOLED = (Run(sizes=(8, 16, 32, 64), whole=False, tau=(1.8, 0.3), weights="equal"),)
+HOLED_QUICK = (replace(HOLED[0], n_iter=4),)
 
 
 def smooth(

@@ -55,7 +55,12 @@ def shrink_slow_waves(
 
 
 def cautious(
-    height: Tensor, reference: Tensor, removed_by: Tensor, noise: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)
+    height: Tensor,
+    reference: Tensor,
+    removed_by: Tensor,
+    noise: Tensor,
+    pixel_size: tuple[float, float] = (1.0, 1.0),
+    moved: Tensor | None = None,
 ) -> Tensor:
     r"""Return to least squares where hardly any of its noise was found.
 
@@ -71,6 +76,8 @@ def cautious(
         removed_by: (N, 1, H, W), z'.
         noise: (N,) standard deviation of one gradient sample.
         pixel_size: (dx, dy).
+        moved: (N, 1, H, W), what noise of random signs leaves in the least-squares height, from which the denominator
+            is estimated where there is a mask; None for a full rectangle.
 
     Returns:
         (N, 1, H, W); r is held fixed in derivatives.
@@ -78,7 +85,8 @@ def cautious(
     variance = height_noise((height.shape[-2], height.shape[-1]), height, pixel_size)
     weight = torch.where(variance > 0, torch.where(variance > 0, variance, 1).pow(-0.25), 0)
     removed = (weight * dct2((removed_by - reference).detach()).square()).sum((-3, -2, -1))
-    risk = noise.detach().square() * (weight * variance).sum()
+    energy = (weight * (variance if moved is None else dct2(moved.detach()).square())).sum((-2, -1)).flatten()
+    risk = noise.detach().square() * energy
     share = torch.where(risk > 0, removed / torch.where(risk > 0, risk, 1), 0)
     return reference + (share / _LEAST_CUT - 1).clamp(0, 1)[:, None, None, None] * (height - reference)
 
