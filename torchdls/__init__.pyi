@@ -40,6 +40,8 @@ from .integrators import LeastSquares as LeastSquares
 from .integrators import LineIntegral as LineIntegral
 from .integrators import MEstimator as MEstimator
 from .integrators import MumfordShah as MumfordShah
+from .integrators import Piecewise as Piecewise
+from .integrators import PiecewiseResult as PiecewiseResult
 from .integrators import RobustResult as RobustResult
 from .integrators import SlopeDLS as SlopeDLS
 from .integrators import SlopeDLSResult as SlopeDLSResult

@@ -104,6 +104,15 @@ METHODS: dict[str, Method] = {
     "mumford_shah": Method(
         {"n_iter": 5, "floor": 0.1}, tol=1e-3, no=ONE_SCALE, exact={"default": {"floor": 0.1, **FEW}}
     ),
+    "piecewise": Method(
+        tol=1e-4,
+        no={
+            **ONE_SCALE,
+            "scales_with_the_slopes": "the rule compares with one pixel",
+            "derivatives_equal_finite_differences": "jumps are held fixed (see test_piecewise.py)",
+        },
+        exact={},
+    ),
     "dls": Method(
         {"patch_size": 4, "stride": 2, "n_atoms": 16, "mu": 0.3, "n_iter": 3, "tol": 0.0, "unused": "keep"},
         tol=1e-4,

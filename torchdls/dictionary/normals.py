@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
+from torchdls._tracing import seen_everywhere
 from torchdls.operators import Patches, dct2, idct2
 
 _TAU = 1.8  # threshold in standard deviations of the noise of a coefficient's two tangential components together
@@ -106,7 +107,7 @@ def _put(parts: Tensor, patches: Patches, shape: tuple[int, int], size: int) -> 
 
 def _continued(n: Tensor, inside: Tensor) -> Tensor:
     """Normals (N, 3, H, W) with those outside the mask continued by normalised convolutions, wider and wider."""
-    if bool(inside.all()):
+    if seen_everywhere(inside):
         return n
     result, known = n, inside
     for width in _WIDTHS:

@@ -12,6 +12,7 @@ from torchdls.integrators.classic import (
     TikhonovRegularization,
 )
 from torchdls.integrators.dls import DLS, DLSResult, dls_objective
+from torchdls.integrators.piecewise import Piecewise, PiecewiseResult
 from torchdls.integrators.robust import (
     L1,
     AnisotropicDiffusion,
@@ -46,6 +47,8 @@ __all__ = [
     "Integrator",
     "LeastSquares",
     "LineIntegral",
+    "Piecewise",
+    "PiecewiseResult",
     "SlopeDLS",
     "SlopeDLSResult",
     "SpectralRegularization",

@@ -34,7 +34,7 @@ def fitted() -> Prior:
     """The coefficients that `benchmarks/quality/fit_jump_prior.py` found."""
     text = resources.files(__package__).joinpath("jump_prior.json").read_text(encoding="utf-8")
     data = json.loads(text)
-    return Prior(*(torch.tensor(data[name], dtype=torch.float64) for name in ("alone", "coupled")))
+    return Prior(*(torch.tensor(data[name], dtype=torch.float64, device="cpu") for name in ("alone", "coupled")))
 
 
 def features(m: Measured) -> Tensor:
@@ -61,18 +61,21 @@ def _directed(near: Tensor, far: Tensor, log_angle: Tensor, bent: Tensor) -> Ten
 
 def incompatible(m: Measured, width: float = 2.0) -> Tensor:
     """(N, 2, H, W): antisymmetric part of the smoothed tensor of the jumps of normals, relative to its size."""
-    jumps = []
-    for dim in (-1, -2):  # n_i b_j - n_j b_i, bounded at grazing angle, brought to the centres of cells
-        near, far = (m.unit.narrow(dim, k, m.unit.shape[dim] - 1) for k in (0, 1))
-        jump = near[:, 2:] * far[:, :2] - far[:, 2:] * near[:, :2]
-        live = m.live[:, [0] if dim == -1 else [1]].narrow(dim, 0, m.unit.shape[dim] - 1)
-        padding = (0, 1) if dim == -1 else (0, 0, 0, 1)
-        whole = pad(torch.where(live, jump, 0), padding)
-        jumps.append((whole + whole.roll(-1, -2 if dim == -1 else -1)) / 2)
-    (xx, xy), (yx, yy) = (blur(j, width).unbind(1) for j in jumps)
+    if min(m.v.shape[-2:]) < 2:
+        return torch.zeros_like(m.v)
+    cells = []
+    for channel, dim in ((0, -1), (1, -2)):  # n_i b_j - n_j b_i, bounded at grazing angle; then its mean over each cell
+        n = m.unit.shape[dim] - 1
+        near, far = (m.unit.narrow(dim, k, n) for k in (0, 1))
+        live = m.live[:, channel : channel + 1].narrow(dim, 0, n)
+        jump = torch.where(live, near[:, 2:] * far[:, :2] - far[:, 2:] * near[:, :2], 0)
+        other = -3 - dim
+        k = jump.shape[other] - 1
+        cells.append(blur((jump.narrow(other, 0, k) + jump.narrow(other, 1, k)) / 2, width))
+    (xx, xy), (yx, yy) = (cell.unbind(1) for cell in cells)
     size = (xx.square() + xy.square() + yx.square() + yy.square()).sqrt()
-    cell = ((xy - yx).abs() / (size + 0.01))[:, None]
-    return torch.cat([(cell + cell.roll(1, -2)) / 2, (cell + cell.roll(1, -1)) / 2], 1)
+    cell = pad((xy - yx).abs() / (size + 0.01), (1, 1, 1, 1))
+    return torch.stack([(cell[:, :-1, 1:] + cell[:, 1:, 1:]) / 2, (cell[:, 1:, :-1] + cell[:, 1:, 1:]) / 2], 1)
 
 
 def log_odds(phi: Tensor, noise: Tensor, around: Tensor | None = None, prior: Prior | None = None) -> Tensor:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchdls.integrators.fields import Fields
 from torchdls.integrators.piecewise.measured import Measured
@@ -19,6 +20,8 @@ _RANGE = 100.0  # pixels over which jumps are spread evenly
 _LEAST = 1e-12  # weight that a cut edge keeps
 _HOLD = 1e-9  # weight of the present height, as part of the largest of the edges: what nothing holds stays
 _DAMPING = 0.3  # share of the coupled odds
+_JUMP = 2.0  # pixels from which a jump has an order
+_DISORDER = 0.3  # share of jumps in the wrong order from which a surface is not believed
 
 
 class Costs(NamedTuple):
@@ -38,9 +41,9 @@ class Problem(NamedTuple):
     Attributes:
         m: the ends.
         phi: features.
-        noise: (N,) of the normals in radians.
-        anchor: (N, 1, H, W) depths and their weights, or None.
-        anchor_weight: likewise.
+        noise: (N,) of the normals that came, in radians.
+        anchor: (N, 1, H, W) depths, or None.
+        anchor_weight: (N, 1, H, W), or None.
         steps: sides of a pixel.
     """
 
@@ -53,11 +56,13 @@ class Problem(NamedTuple):
 
     @classmethod
     def of(cls, m: Measured, noise: Tensor, fields: Fields) -> Problem:
-        """The problem of what was measured."""
-        return cls(m, features(m), noise, fields.anchor, fields.anchor_weight, fields.steps)
+        """The problem of what was measured, with the anchors of the fields."""
+        size = m.v[:, :1]
+        anchor, weight = (None if f is None else f.expand_as(size) for f in (fields.anchor, fields.anchor_weight))
+        return cls(m, features(m), noise, anchor, weight, fields.steps)
 
     def slopes(self, y: Tensor) -> Tensor:
-        """(N, 2, H, W) those of a height, 0 where there is no edge."""
+        """(N, 2, H, W) those of a depth, 0 where there is no edge."""
         return torch.where(self.m.live, GradientOperator("forward", self.steps)(y), 0)
 
     def jumps(self, y: Tensor) -> Tensor:
@@ -65,26 +70,21 @@ class Problem(NamedTuple):
         return self.slopes(y) - self.m.v
 
     def solve(self, w: Tensor, v: Tensor | None = None, y: Tensor | None = None) -> Tensor:
-        """The minimum of sum w (A y - v)^2 and of the anchors, what is loose held where it is (y)."""
-        v = self.m.v if v is None else v
-        w = w * self.m.trust
-        hold = _HOLD * largest(w)
-        alive = edge_ends(w) > 0
-        a = GradientOperator("forward", self.steps)
+        """The minimum of sum w (A y - v)^2 and of the anchors; what is loose is held at y, or at 0."""
+        v, w = self.m.v if v is None else v, w * self.m.trust
         b = w * (v if y is None else v - self.slopes(y))
-        b, r = a.adjoint(b), torch.where(alive, hold, 0)
-        if self.anchor_weight is not None:
-            pull = self.anchor_weight if self.anchor is None else self.anchor_weight * 1.0
-            b = b + pull * (self.anchor - (0 if y is None else y))
-            r = r + pull
-        found = factor(w, r, self.steps)
-        x = found.solve(b)
+        b = GradientOperator("forward", self.steps).adjoint(b)
+        r = torch.where(edge_ends(w) > 0, _HOLD * _per_surface(w.flatten(1).amax(1)), 0)
+        if self.anchor is not None and self.anchor_weight is not None:
+            b = b + self.anchor_weight * (self.anchor if y is None else self.anchor - y)
+            r = r + self.anchor_weight
+        x = factor(w, r, self.steps).solve(b)
         return x if y is None else y + x
 
 
-def largest(x: Tensor) -> Tensor:
-    """(N, 1, 1, 1) of each surface."""
-    return x.flatten(1).amax(1)[:, None, None, None]
+def _per_surface(x: Tensor) -> Tensor:
+    """(N,) as (N, 1, 1, 1)."""
+    return x[:, None, None, None]
 
 
 def odds(problem: Problem, y: Tensor | None = None, widen: float = 1.0) -> Tensor:
@@ -121,7 +121,7 @@ def robust_weights(problem: Problem, y: Tensor, cost: Costs, widen: float = 1.0)
     r = problem.jumps(y)
     s = widen * problem.m.scale
     bent = (s.square() / (s.square() + r.square())).square().clamp(min=_LEAST)
-    return cost.of(r) * bent * (problem.m.scale.flatten(1).amin(1)[:, None, None, None] / s).square()
+    return cost.of(r) * bent * (_per_surface(problem.m.scale.flatten(1).amin(1)) / s).square()
 
 
 def robust(problem: Problem, y: Tensor, cost: Costs, widths: Iterable[float]) -> Tensor:
@@ -131,7 +131,7 @@ def robust(problem: Problem, y: Tensor, cost: Costs, widths: Iterable[float]) ->
     return y
 
 
-def coupled(problem: Problem, y: Tensor, widths: Iterable[float] = (8, 4, 2, 1.4, 1, 1), each: int = 2) -> Tensor:
+def coupled(problem: Problem, y: Tensor, widths: Iterable[float] = (4, 2, 1, 1), each: int = 2) -> Tensor:
     """Graduated steps whose costs are those of contours that go on, seen at the present height."""
     for widen in widths:
         cost = costs(problem, odds(problem, y, widen), widen)
@@ -139,19 +139,13 @@ def coupled(problem: Problem, y: Tensor, widths: Iterable[float] = (8, 4, 2, 1.4
     return y
 
 
-def convex(problem: Problem, n_iter: int = 10) -> Tensor:
-    """The least sum of (1 - P) |r|, P of the side that would be nearer, by reweighted solves."""
-    p = odds(problem).sigmoid().clamp(1e-4, 1 - 1e-3)
-    keep = Costs(*(1 - p).unbind(1))
-    y = problem.solve(torch.minimum(keep.i, keep.j))
-    for k in range(n_iter):
-        e = 0.02 ** (k / (n_iter - 1))
-        r = problem.jumps(y)
-        y = problem.solve(keep.of(r) / (r.square() + e * e).sqrt(), y=y)
-    return y
+def opened(problem: Problem, likely: float = 0.02) -> Tensor:
+    """Least squares with weight (1 + (P / likely)^2)^-2: every edge that may be cut, whichever way, is nearly so."""
+    p = odds(problem).sigmoid().sum(1)
+    return problem.solve((1 + (p / likely).square()).square().reciprocal().clamp(min=1e-6))
 
 
-def bilateral(problem: Problem, n_iter: int = 20, k: float = 2.0) -> Tensor:
+def bilateral(problem: Problem, n_iter: int = 15, k: float = 2.0) -> Tensor:
     """One-sided trusts, as in `Bilateral`."""
     m = problem.m
     square = m.facing.square()
@@ -163,8 +157,55 @@ def bilateral(problem: Problem, n_iter: int = 20, k: float = 2.0) -> Tensor:
         v = (w * m.slopes).sum(1) / total.clamp(min=1e-30)
         y = problem.solve(total.clamp(min=1e-8), v, y)
         d = problem.slopes(y).square()
-        before = torch.stack([torch.nn.functional.pad(d[:, 0, :, :-1], (1, 0)), torch.nn.functional.pad(d[:, 1, :-1], (0, 0, 1, 0))], 1)
-        after = torch.stack([torch.nn.functional.pad(d[:, 0, :, 1:], (0, 1)), torch.nn.functional.pad(d[:, 1, 1:], (0, 0, 0, 1))], 1)
+        x_side, y_side = d[:, 0], d[:, 1]
+        before = torch.stack([pad(x_side[..., :-1], (1, 0)), pad(y_side[:, :-1], (0, 0, 1, 0))], 1)
+        after = torch.stack([pad(x_side[..., 1:], (0, 1)), pad(y_side[:, 1:], (0, 0, 0, 1))], 1)
         side = torch.sigmoid(k * square * (torch.stack([before, after], 1) - d[:, None]))
     assert y is not None
     return y
+
+
+def posterior(problem: Problem, y: Tensor) -> Tensor:
+    """(N, 2, H, W) probability that an edge is cut at y, 0 where there is none.
+
+    The odds of its side being nearer, with the contours around, times what the jump r itself says: density 1 / range if
+    cut, s / (pi (s^2 + r^2)) if not.
+    """
+    r, s = problem.jumps(y), problem.m.scale
+    i, j = odds(problem, y).unbind(1)
+    likelihood = (math.pi * (s.square() + r.square()) / (s * _RANGE)).log()
+    return torch.where(problem.m.live, (torch.where(r > 0, i, j) + likelihood).sigmoid(), 0)
+
+
+def out_of_order(problem: Problem, y: Tensor) -> Tensor:
+    """(N,) share of the jumps above two pixels for which it was more likely, e times, that the other side is nearer."""
+    r = problem.jumps(y)
+    i, j = odds(problem).unbind(1)
+    cut = problem.m.live & (r.abs() > _JUMP) & (r.abs() > problem.m.scale)
+    wrong = cut & (torch.where(r > 0, j - i, i - j) > 1)
+    return wrong.flatten(1).sum(1) / cut.flatten(1).sum(1).clamp(min=1)
+
+
+class Found(NamedTuple):
+    """What the search found: depth (N, 1, H, W), weights and probability of a cut (N, 2, H, W)."""
+
+    y: Tensor
+    weight: Tensor
+    cut: Tensor
+
+
+def search(problem: Problem) -> Found:
+    """The two starts, the steps from them, and the choice.
+
+    Where all that may be cut starts open, jumps are found best, but what hangs together by nothing lies anywhere.
+    Where rims or ties tell the order of the sides, few jumps contradict it; where many do, the one-sided trusts are the
+    safer guess. Otherwise the energy decides.
+    """
+    plain = costs(problem, odds(problem))
+    safe = robust(problem, bilateral(problem), plain, [1.0] * 6)
+    bold = coupled(problem, opened(problem))
+    lower = energy(problem, bold, plain) < energy(problem, safe, plain)
+    y = torch.where(_per_surface(lower & (out_of_order(problem, bold) < _DISORDER)), bold, safe)
+    cost = costs(problem, odds(problem, y))
+    weight = robust_weights(problem, y, cost) * problem.m.trust
+    return Found(y, weight, posterior(problem, y))
