@@ -108,10 +108,13 @@ METHODS: dict[str, Method] = {
         tol=1e-4,
         no={
             **ONE_SCALE,
+            "follows_flips": "the grids of the patches of normals begin at one side; without noise see test_piecewise.py",
+            "follows_a_transpose": "where nothing jumps it is SlopeDLS, which does not",
+            "follows_a_quarter_turn": "as for the transpose",
             "scales_with_the_slopes": "the rule compares with one pixel",
             "derivatives_equal_finite_differences": "jumps are held fixed (see test_piecewise.py)",
         },
-        exact={},
+        exact={"default": {"noise": 0.0, "solve_tol": 1e-13}},
     ),
     "dls": Method(
         {"patch_size": 4, "stride": 2, "n_atoms": 16, "mu": 0.3, "n_iter": 3, "tol": 0.0, "unused": "keep"},

@@ -13,11 +13,11 @@ from torchdls._tracing import is_concrete
 from torchdls.dictionary.normals import code_normals, curl_noise
 from torchdls.integrators.base import Fields
 from torchdls.integrators.iterative import Callback, Iterative
-from torchdls.integrators.piecewise.measured import GRAZING, believed, measure
+from torchdls.integrators.piecewise.measured import GRAZING, believed, filled, measure
 from torchdls.integrators.piecewise.pieces import pieces_of, tied_pieces
 from torchdls.integrators.piecewise.search import Problem, search
 from torchdls.integrators.slope_dls import SlopeDLS
-from torchdls.operators import edge_slopes
+from torchdls.operators import edge_slopes, present_edges
 from torchdls.solvers import solve
 from torchdls.solvers.poisson import fold_vmap
 
@@ -95,7 +95,8 @@ class Piecewise(Iterative[PiecewiseResult]):
 
     Args:
         focal_length: of the camera in pixels, where the gradient is that of log depth; None for heights.
-        noise: of the normals, in radians per tangential component; None reads it from the curl.
+        noise: None to read it from the curl, and to code the normals of the slopes. Or, where the slopes are those of
+            normals that `denoise_normals` has coded, the `sigma` that it found; 0 for slopes without noise.
         solve_tol: relative residual of the last solve and of its derivative.
         pixel_size: (dx, dy) or one number; heights come out in its unit.
 
@@ -139,7 +140,7 @@ class Piecewise(Iterative[PiecewiseResult]):
     def iterate(self, fields: Fields, callback: Callback | None = None) -> PiecewiseResult:
         """The search, the last solve, and what it says of pieces."""
         scale = -1.0 if self.focal_length is None else self.focal_length
-        slopes, noise = self._coded(fields, scale * fields.gradient.double())
+        slopes, noise = self._coded(fields, scale * filled(fields.gradient.double(), fields))
         w, d, cut, smooth, pieces, tied = _Search.apply(
             slopes, fields.mask, fields.weight, fields.anchor, fields.anchor_weight, noise, scale, fields.steps
         )
@@ -151,14 +152,13 @@ class Piecewise(Iterative[PiecewiseResult]):
 
     def _coded(self, fields: Fields, p: Tensor) -> tuple[Tensor, Tensor]:
         """Slopes of the depth in pixels without noise (N, 2, H, W), and what noise their normals had (N,)."""
+        if self.noise is not None:
+            return p, p.new_full((len(p),), self.noise)
         n = (1 + p.square().sum(1, keepdim=True)).rsqrt()
         inside = torch.ones_like(n, dtype=torch.bool) if fields.mask is None else fields.mask.expand_as(n)
         if fields.weight is not None:
             inside = inside & (fields.weight > 0).all(1, keepdim=True)
-        if self.noise is None:
-            noise = curl_noise((p * n).detach(), n.detach(), inside)
-        else:
-            noise = p.new_full((len(p),), self.noise)
+        noise = curl_noise((p * n).detach(), n.detach(), inside)
         noisy = noise > _NOISY
         noise = torch.where(noisy, noise, 0)
         if is_concrete(noisy) and not bool(noisy.any()):
@@ -171,8 +171,9 @@ class Piecewise(Iterative[PiecewiseResult]):
     def _joined(self, fields: Fields, p: Tensor, w: Tensor, d: Tensor) -> Tensor:
         """The height of slopes p at the pixels, in float64 and back."""
         weight = None if fields.weight is None else fields.weight.double()
-        v, _ = edge_slopes(p, fields.mask, weight)
-        hold = torch.where(w > 0, _HELD * w.flatten(1).amax(1)[:, None, None, None], 0)
+        v, trust = edge_slopes(p, fields.mask, weight)
+        trust = present_edges(v) if trust is None else trust
+        w, hold = w * trust, (trust > 0) * _HELD * (w * trust).detach().flatten(1).amax(1)[:, None, None, None]
         total = w + hold
         v = (w * v + hold * d) / torch.where(total > 0, total, 1)
         anchor, r = (None if f is None else f.double() for f in (fields.anchor, fields.anchor_weight))

@@ -62,8 +62,7 @@ def measure(p: Tensor, fields: Fields, noise: Tensor) -> Measured:
     p = p * (n / n.clamp(min=GRAZING))
     v, trust = edge_slopes(p, fields.mask, fields.weight)
     trust = present_edges(v) if trust is None else trust
-    weight = None if fields.weight is None else fields.weight.expand_as(p)
-    slopes, facing = ends(p, weight), ends(n.expand_as(p), weight)
+    slopes, facing = ends(p), ends(n.expand_as(p))
     live = trust > 0
     half = noise[:, None, None, None]
     spread = torch.where(live, (slopes[:, 0] - slopes[:, 1]).abs(), 0)
@@ -74,13 +73,26 @@ def measure(p: Tensor, fields: Fields, noise: Tensor) -> Measured:
     return Measured(slopes, facing, v, trust, unit, _angles(unit), scale)
 
 
-def ends(field: Tensor, weight: Tensor | None = None) -> Tensor:
-    """A field (N, 2, H, W) at both ends of the edges; where one end has no weight, the other speaks for both."""
-    i, j = field, ahead(field)
-    if weight is not None:
-        w_i, w_j = weight, ahead(weight)
-        i, j = torch.where((w_i == 0) & (w_j > 0), j, i), torch.where((w_j == 0) & (w_i > 0), i, j)
-    return torch.stack([i, j], 1)
+def filled(g: Tensor, fields: Fields) -> Tensor:
+    """Slopes (N, 2, H, W) with those of no weight replaced by the mean of those beside them, or 0."""
+    if fields.weight is None:
+        return g
+    told = (fields.weight > 0).expand_as(g)
+    told = told if fields.mask is None else told & fields.mask
+    known, count = torch.where(told, g, 0), told.to(g)
+    total, number = (_beside(f) for f in (known, count))
+    return torch.where(told, g, total / number.clamp(min=1))
+
+
+def _beside(f: Tensor) -> Tensor:
+    """Sum over the four neighbours."""
+    wide = pad(f, (1, 1, 1, 1))
+    return wide[..., 1:-1, 2:] + wide[..., 1:-1, :-2] + wide[..., 2:, 1:-1] + wide[..., :-2, 1:-1]
+
+
+def ends(field: Tensor) -> Tensor:
+    """A field (N, 2, H, W) at both ends of the edges: (N, 2 ends, 2, H, W)."""
+    return torch.stack([field, ahead(field)], 1)
 
 
 def ahead(field: Tensor) -> Tensor:

@@ -187,7 +187,7 @@ def out_of_order(problem: Problem, y: Tensor) -> Tensor:
 
 
 class Found(NamedTuple):
-    """What the search found: depth (N, 1, H, W), weights and probability of a cut (N, 2, H, W)."""
+    """What the search found: depth (N, 1, H, W), weights but for the trusts, probability of a cut (N, 2, H, W)."""
 
     y: Tensor
     weight: Tensor
@@ -207,5 +207,4 @@ def search(problem: Problem) -> Found:
     lower = energy(problem, bold, plain) < energy(problem, safe, plain)
     y = torch.where(_per_surface(lower & (out_of_order(problem, bold) < _DISORDER)), bold, safe)
     cost = costs(problem, odds(problem, y))
-    weight = robust_weights(problem, y, cost) * problem.m.trust
-    return Found(y, weight, posterior(problem, y))
+    return Found(y, robust_weights(problem, y, cost), posterior(problem, y))
