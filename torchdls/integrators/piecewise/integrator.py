@@ -15,7 +15,7 @@ from torchdls.integrators.base import Fields
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.piecewise.measured import GRAZING, believed, filled, measure
 from torchdls.integrators.piecewise.pieces import pieces_of, tied_pieces
-from torchdls.integrators.piecewise.search import Problem, search
+from torchdls.integrators.piecewise.search import Problem, odds, search
 from torchdls.integrators.slope_dls import SlopeDLS
 from torchdls.operators import edge_slopes, present_edges
 from torchdls.solvers import solve
@@ -24,6 +24,7 @@ from torchdls.solvers.poisson import fold_vmap
 _NOISY = math.radians(0.9)  # noise of the normals, per tangential component, from which they are coded
 _LEFT = 0.4  # share of the noise that the coder leaves
 _FEW = 4  # edges cut below which a surface does not jump
+_LIKELY = 0.1  # probability from which an edge may be cut
 _HELD = 1e-8  # weight of the jumps found, as part of the largest of the edges
 
 
@@ -213,7 +214,8 @@ class _Search(torch.autograd.Function):
         cut = jump > 0.5
         smooth = cut.flatten(1).sum(1) < _FEW
         held = torch.zeros_like(inside) if anchor_weight is None else (anchor_weight > 0).expand_as(inside) & inside
-        pieces = pieces_of(cut & ~smooth[:, None, None, None], live, inside)
+        likely = odds(problem).sigmoid().sum(1) > _LIKELY
+        pieces = pieces_of(cut & ~smooth[:, None, None, None], likely, live, inside)
         return w, problem.slopes(y), jump, smooth, pieces, tied_pieces(pieces, live, held)
 
     @staticmethod
