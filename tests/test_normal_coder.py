@@ -103,7 +103,9 @@ def test_derivative_equals_finite_differences():
 
 def test_vmap_is_a_loop():
     n = torch.stack([noisy(true_normals(16), 8, seed=s) for s in range(2)])
-    together = torch.vmap(lambda x: code_normals(x, torch.ones_like(x[:, :1], dtype=torch.bool), torch.full((1,), 0.1)))(n)
+    together = torch.vmap(
+        lambda x: code_normals(x, torch.ones_like(x[:, :1], dtype=torch.bool), torch.full((1,), 0.1))
+    )(n)
     for found, one in zip(together, n, strict=True):
         torch.testing.assert_close(found, code_normals(one, one[:, :1] < 2, torch.full((1,), 0.1)))
 

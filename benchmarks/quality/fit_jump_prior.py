@@ -24,7 +24,7 @@ from benchmarks.quality.scenes import FAMILIES, FITTED, UNSEEN, Scene, noisy, sc
 from torchdls.dictionary.normals import blur
 from torchdls.integrators.fields import Fields
 from torchdls.integrators.piecewise.measured import measure
-from torchdls.integrators.piecewise.prior import NAMES, Prior, continued, features, fitted, log_odds
+from torchdls.integrators.piecewise.prior import NAMES, Prior, continued, features, fitted
 
 DEGREES = (0.4, 2.0, 5.0, 10.0, 20.0)
 WHERE = Path(torchdls.__file__).parent / "integrators" / "piecewise" / "jump_prior.json"

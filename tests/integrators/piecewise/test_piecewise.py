@@ -7,7 +7,17 @@ import torch
 from torch import Tensor
 
 from tests.helpers import random_field
-from torchdls import SURFACES, Bilateral, LeastSquares, Piecewise, SlopeDLS, edge_slopes, normals_to_gradient, rmse, solve
+from torchdls import (
+    SURFACES,
+    Bilateral,
+    LeastSquares,
+    Piecewise,
+    SlopeDLS,
+    edge_slopes,
+    normals_to_gradient,
+    rmse,
+    solve,
+)
 from torchdls.integrators.fields import Fields
 from torchdls.integrators.piecewise.integrator import _HELD, _Search
 from torchdls.integrators.piecewise.measured import GRAZING, believed, ends, filled, measure
@@ -32,7 +42,11 @@ def ball_before_a_wall(n: int = 40, above: float = 30.0) -> tuple[Tensor, Tensor
     z = torch.where(inside, (r**2 - x**2 - y**2).clamp(min=1e-12).sqrt(), 1.0)
     normals = torch.where(inside, torch.stack([x, -y, z]) / r, torch.tensor([0, 0, 1.0]).double().view(3, 1, 1))
     field = normals_to_gradient(normals[None])
-    return field.gradient, field.mask, torch.where(inside, above + z, 0.1 * x)[None, None] - torch.where(inside, 0, 0.1 * x)
+    return (
+        field.gradient,
+        field.mask,
+        torch.where(inside, above + z, 0.1 * x)[None, None] - torch.where(inside, 0, 0.1 * x),
+    )
 
 
 def problem_of(p: Tensor, weight: Tensor | None = None) -> Problem:

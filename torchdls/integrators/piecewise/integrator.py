@@ -82,7 +82,8 @@ class Piecewise(Iterative[PiecewiseResult]):
     3. The energy \sum_e c_e r^2 / (r^2 + s^2), r = A y - v and c that of the side that r makes nearer, is lowered by
        reweighted solves from two starts: one-sided trusts (as `Bilateral`), and least squares with all open that may be
        cut, with s falling from 4 s to s and costs that fall where contours go on.
-    4. The lower of the two is taken; but never the second where 0.3 of its jumps are in the less likely order.
+    4. The lower of the two is taken; but never the second where 0.3 of its jumps are in the less likely order. Where
+       the surface jumps, and into which pieces it falls, is read from the second in any case.
 
     Where no jump is found, the height is that of `SlopeDLS`, on a field that does not jump. A piece whose contour
     jumps all around has no tie in the slopes: its height is a guess, the result says so (`tied`), and an anchor sets
@@ -110,7 +111,7 @@ class Piecewise(Iterative[PiecewiseResult]):
     Example:
         >>> x = torch.arange(32.0).expand(32, 32)
         >>> block = (x > 8) & (x.mT > 8) & (x.mT < 24)
-        >>> slopes = torch.stack([torch.where(block, 0.5, 0.0), torch.zeros(32, 32)])[None]  # a ramp, hinged at its left
+        >>> slopes = torch.stack([0.5 * block, torch.zeros(32, 32)])[None]  # a ramp, hinged at its left
         >>> true = torch.where(block, (x - 8) / 2, 0.0)[None, None]
         >>> methods = torchdls.LeastSquares(), torchdls.Piecewise()
         >>> [round(float(torchdls.rmse(method(slopes), true)), 1) for method in methods]

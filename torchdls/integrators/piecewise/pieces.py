@@ -8,16 +8,15 @@ from torch import Tensor
 from torchdls.integrators.piecewise.prior import continued
 from torchdls.solvers import connected_components
 
-
-_NARROW = 4  # edges by which a contour is continued at either end, where it may
+_NARROW = 8  # edges by which a contour is continued at either end, where it may
 
 
 def pieces_of(cut: Tensor, likely: Tensor, live: Tensor, inside: Tensor) -> Tensor:
     """(N, 1, H, W) int64: 1 for the largest piece, 2 for the next, ..; 0 outside the mask.
 
     Where a jump changes its sign along a contour it is small, and its edges look whole. So contours are continued by up
-    to 4 edges at either end along those that may be cut, and gaps of one edge are closed: what hangs together by a
-    narrower tie than 8 edges on a contour counts as apart.
+    to 8 edges at either end along those that may be cut, and gaps of one edge are closed: what hangs together by a
+    narrower tie than 16 edges on a contour counts as apart.
 
     Args:
         cut: (N, 2, H, W) bool.

@@ -54,9 +54,9 @@ def features(m: Measured) -> Tensor:
 
 def _directed(near: Tensor, far: Tensor, log_angle: Tensor, bent: Tensor) -> Tensor:
     a, away = near.clamp(0, 90) / 90, (-near).clamp(0, 60) / 60
-    d, f, l = ((near - far) / 45).clamp(-1.5, 3), far.clamp(-90, 90) / 90, log_angle
-    parts = [torch.ones_like(a), a, a * a, away, l, l * l, a * l, a * a * l, away * l, d, d * d.abs()]
-    return torch.stack([*parts, bent, bent * bent, bent * l, bent * a, f, f.abs()], 1)
+    d, f, b = ((near - far) / 45).clamp(-1.5, 3), far.clamp(-90, 90) / 90, log_angle
+    parts = [torch.ones_like(a), a, a * a, away, b, b * b, a * b, a * a * b, away * b, d, d * d.abs()]
+    return torch.stack([*parts, bent, bent * bent, bent * b, bent * a, f, f.abs()], 1)
 
 
 def incompatible(m: Measured, width: float = 2.0) -> Tensor:

@@ -199,7 +199,7 @@ def search(problem: Problem) -> Found:
 
     Where all that may be cut starts open, jumps are found best, but what hangs together by nothing lies anywhere.
     Where rims or ties tell the order of the sides, few jumps contradict it; where many do, the one-sided trusts are the
-    safer guess. Otherwise the energy decides.
+    safer guess. Otherwise the energy decides. Where the surface jumps, the second start tells in any case.
     """
     plain = costs(problem, odds(problem))
     safe = robust(problem, bilateral(problem), plain, [1.0] * 6)
@@ -207,4 +207,4 @@ def search(problem: Problem) -> Found:
     lower = energy(problem, bold, plain) < energy(problem, safe, plain)
     y = torch.where(_per_surface(lower & (out_of_order(problem, bold) < _DISORDER)), bold, safe)
     cost = costs(problem, odds(problem, y))
-    return Found(y, robust_weights(problem, y, cost), posterior(problem, y))
+    return Found(y, robust_weights(problem, y, cost), posterior(problem, bold))
