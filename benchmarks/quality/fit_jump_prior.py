@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
+from itertools import pairwise
 from math import radians
 from pathlib import Path
 from typing import NamedTuple
@@ -127,7 +128,7 @@ def predicted(data: Rows, prior: Prior, coupled: bool) -> Tensor:
 def calibration(q: Tensor, data: Rows) -> list[tuple[float, float, int]]:
     """Mean prediction, share of cuts and number of edges, in bins of the prediction."""
     edges = [0, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 1.01]
-    bins = [(q >= a) & (q < b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    bins = [(q >= a) & (q < b) for a, b in pairwise(edges)]
     return [(mean(q[b], data.weight[b]), mean(data.cut[b], data.weight[b]), int(b.sum())) for b in bins if b.any()]
 
 
@@ -161,10 +162,8 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="small and few")
     args = parser.parse_args()
     size, seeds, unseen = (32, FITTED[:1], UNSEEN[:1]) if args.smoke else (args.size, FITTED, UNSEEN)
-    if args.check:
-        prior = fitted()
-    else:
-        prior = fit(rows([scene(family, seed, size) for family in FAMILIES for seed in seeds]))
+    scenes = [] if args.check else [scene(family, seed, size) for family in FAMILIES for seed in seeds]
+    prior = fitted() if args.check else fit(rows(scenes))
     print("coefficients without noise:", dict(zip(NAMES, prior.alone[0].numpy().round(3).tolist(), strict=True)))
     if args.write and not args.check:
         data = {"names": NAMES, **{k: v.numpy().round(5).tolist() for k, v in prior._asdict().items()}}

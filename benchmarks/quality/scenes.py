@@ -153,8 +153,8 @@ def seen(name: str, normal: Array, t: Array, ray: Array, camera: Array) -> Scene
 
 def scene_of(name: str, normal: Array, mask: NDArray[np.bool_], depth: Array, camera: Array | None) -> Scene:
     normals = torch.from_numpy(np.moveaxis(normal, -1, 0).copy())[None]
-    fields = (torch.from_numpy(a.copy())[None, None] for a in (mask, depth))
-    return Scene(name, normals, *fields, None if camera is None else torch.from_numpy(camera))
+    inside, far = (torch.from_numpy(a.copy())[None, None] for a in (mask, depth))
+    return Scene(name, normals, inside, far, None if camera is None else torch.from_numpy(camera))
 
 
 def trace(name: str, distance: Distance, focal: float, size: int, away: float = 10.0) -> Scene:

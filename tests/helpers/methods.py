@@ -108,7 +108,7 @@ METHODS: dict[str, Method] = {
         tol=1e-4,
         no={
             **ONE_SCALE,
-            "follows_flips": "the grids of the patches of normals begin at one side; without noise see test_piecewise.py",
+            "follows_flips": "the grids of the patches begin at one side; without noise see test_piecewise.py",
             "follows_a_transpose": "where nothing jumps it is SlopeDLS, which does not",
             "follows_a_quarter_turn": "as for the transpose",
             "scales_with_the_slopes": "the rule compares with one pixel",
