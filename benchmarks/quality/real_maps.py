@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from math import radians
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,6 +28,7 @@ from torchdls import INTEGRATORS, denoise_normals, io, normals_to_gradient
 from torchdls.metrics import mean_absolute_depth_error
 
 METHODS = ("least_squares", "bilateral", "slope_dls", "piecewise")
+NOISY = radians(0.9)  # per tangential component: the noise from which normals are coded
 LEVELS = ("0", "5", "10", "20", "8bit")
 
 
@@ -67,8 +69,10 @@ def integrate(one: Scene, normals: Tensor, name: str) -> Run:
     options: dict[str, Any] = {"focal_length": focal} if name == "bilateral" else {}
     began = time.process_time()
     if name == "piecewise":
-        normals, sigma = denoise_normals(normals, one.mask, camera=one.camera)
-        options = {"noise": float(sigma), "focal_length": None if one.camera is None else focal}
+        options = {"focal_length": None if one.camera is None else focal}
+        coded, sigma = denoise_normals(normals, one.mask, camera=one.camera)
+        if float(sigma) > NOISY:
+            normals, options["noise"] = coded, float(sigma)
     field = normals_to_gradient(normals, mask=one.mask, camera=one.camera)
     with torch.no_grad():
         found = INTEGRATORS[name](**options).solve(field.gradient, field.mask)

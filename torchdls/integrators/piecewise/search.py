@@ -21,7 +21,7 @@ _LEAST = 1e-12  # weight that a cut edge keeps
 _HOLD = 1e-9  # weight of the present height, as part of the largest of the edges: what nothing holds stays
 _DAMPING = 0.3  # share of the coupled odds
 _JUMP = 2.0  # pixels from which a jump has an order
-_DISORDER = 0.3  # share of jumps in the wrong order from which a surface is not believed
+_DISORDER = 0.25  # share of jumps in the wrong order from which a surface is not believed
 
 
 class Costs(NamedTuple):
