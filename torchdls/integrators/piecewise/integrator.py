@@ -82,8 +82,8 @@ class Piecewise(Iterative[PiecewiseResult]):
     3. The energy \sum_e c_e r^2 / (r^2 + s^2), r = A y - v and c that of the side that r makes nearer, is lowered by
        reweighted solves from two starts: one-sided trusts (as `Bilateral`), and least squares with all open that may be
        cut, with s falling from 4 s to s and costs that fall where contours go on.
-    4. The lower of the two is taken; but never the second where a quarter of its jumps are in the less likely order. Where
-       the surface jumps, and into which pieces it falls, is read from the second in any case.
+    4. The second is taken where its energy is lower by 2 % and less than a quarter of its jumps are in the less likely
+       order. Where the surface jumps, and into which pieces it falls, is read from it in any case.
 
     Where no jump is found, the height is that of `SlopeDLS`, on a field that does not jump. A piece whose contour
     jumps all around has no tie in the slopes: its height is a guess, the result says so (`tied`), and an anchor sets

@@ -21,6 +21,7 @@ _LEAST = 1e-12  # weight that a cut edge keeps
 _HOLD = 1e-9  # weight of the present height, as part of the largest of the edges: what nothing holds stays
 _DAMPING = 0.3  # share of the coupled odds
 _JUMP = 2.0  # pixels from which a jump has an order
+_CLEARLY = 0.98  # of another energy, from which one is lower
 _DISORDER = 0.25  # share of jumps in the wrong order from which a surface is not believed
 
 
@@ -204,7 +205,7 @@ def search(problem: Problem) -> Found:
     plain = costs(problem, odds(problem))
     safe = robust(problem, bilateral(problem), plain, [1.0] * 6)
     bold = coupled(problem, opened(problem))
-    lower = energy(problem, bold, plain) < energy(problem, safe, plain)
+    lower = energy(problem, bold, plain) < _CLEARLY * energy(problem, safe, plain)
     y = torch.where(_per_surface(lower & (out_of_order(problem, bold) < _DISORDER)), bold, safe)
     cost = costs(problem, odds(problem, y))
     return Found(y, robust_weights(problem, y, cost), posterior(problem, bold))
