@@ -21,7 +21,7 @@ FLOORS = ["operators", "solvers", "dictionary", "noise", "selection", "integrato
 MAY_IMPORT = {floor: set(FLOORS[:i]) for i, floor in enumerate(FLOORS)}
 # Rooms that stand beside them.
 MAY_IMPORT |= {
-    "geometry": {"operators"},
+    "geometry": {"operators", "dictionary"},
     "surfaces": {"operators"},
     "metrics": {"operators", "geometry"},
     "photometric": {"operators", "solvers", "dictionary", "geometry"},

@@ -80,6 +80,7 @@ INTEGRATORS: Registry[Integrator] = Registry(
         "anisotropic_diffusion": "AnisotropicDiffusion",
         "bilateral": "Bilateral",
         "mumford_shah": "MumfordShah",
+        "piecewise": "Piecewise",
         "dls": "DLS",
         "slope_dls": "SlopeDLS",
     }

@@ -104,6 +104,18 @@ METHODS: dict[str, Method] = {
     "mumford_shah": Method(
         {"n_iter": 5, "floor": 0.1}, tol=1e-3, no=ONE_SCALE, exact={"default": {"floor": 0.1, **FEW}}
     ),
+    "piecewise": Method(
+        tol=1e-4,
+        no={
+            **ONE_SCALE,
+            "follows_flips": "the grids of the patches begin at one side; without noise see test_piecewise.py",
+            "follows_a_transpose": "where nothing jumps it is SlopeDLS, which does not",
+            "follows_a_quarter_turn": "as for the transpose",
+            "scales_with_the_slopes": "the rule compares with one pixel",
+            "derivatives_equal_finite_differences": "jumps are held fixed (see test_piecewise.py)",
+        },
+        exact={"default": {"noise": 0.0, "solve_tol": 1e-13}},
+    ),
     "dls": Method(
         {
             "patch_size": 4,

@@ -1,6 +1,7 @@
 """Normals, gradients, conventions and cameras: what comes in from other tools, and goes back to them."""
 
 from torchdls.geometry.cameras import depth_to_points, height_to_points, log_depth_to_depth
+from torchdls.geometry.coder import CodedNormals, denoise_normals, normal_noise
 from torchdls.geometry.conventions import (
     GRADIENT_CONVENTIONS,
     NORMAL_CONVENTIONS,
@@ -18,6 +19,9 @@ from torchdls.geometry.normals import (
 )
 
 __all__ = [
+    "CodedNormals",
+    "denoise_normals",
+    "normal_noise",
     "ConventionGuess",
     "GRADIENT_CONVENTIONS",
     "GradientField",

@@ -12,6 +12,7 @@ from torchdls.integrators.classic import (
     TikhonovRegularization,
 )
 from torchdls.integrators.dls import DLS, DLSResult, Exact, Implicit, Proximal, Unroll, dls_objective
+from torchdls.integrators.piecewise import Piecewise, PiecewiseResult
 from torchdls.integrators.robust import (
     L1,
     AnisotropicDiffusion,
@@ -49,6 +50,8 @@ __all__ = [
     "LeastSquares",
     "LineIntegral",
     "Proximal",
+    "Piecewise",
+    "PiecewiseResult",
     "SlopeDLS",
     "SlopeDLSResult",
     "SpectralRegularization",

@@ -302,7 +302,6 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
     def _holed(self, fields: Fields, noise: Noise, callback: Callback | None = None) -> SlopeDLSResult:
         """By the runs of the recipe for holes, unequal weights or anchors."""
         data = Quadratic.of(fields)
-        v, w, _ = data
         misfit: list[Tensor] = []
 
         def watch(z: Tensor) -> None:

@@ -1,0 +1,211 @@
+"""The search for the jumps of a field: energy, starts, and the steps that lead from them. Nothing is differentiated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchdls.integrators.fields import Fields
+from torchdls.integrators.piecewise.measured import Measured
+from torchdls.integrators.piecewise.prior import continued, features, log_odds
+from torchdls.operators import GradientOperator, edge_ends
+from torchdls.solvers.nested_dissection import factor
+
+_RANGE = 100.0  # pixels over which jumps are spread evenly
+_LEAST = 1e-12  # weight that a cut edge keeps
+_HOLD = 1e-9  # weight of the present height, as part of the largest of the edges: what nothing holds stays
+_DAMPING = 0.3  # share of the coupled odds
+_JUMP = 2.0  # pixels from which a jump has an order
+_CLEARLY = 0.98  # of another energy, from which one is lower
+_DISORDER = 0.25  # share of jumps in the wrong order from which a surface is not believed
+
+
+class Costs(NamedTuple):
+    """What a cut costs in nats, (N, 2, H, W), where i is nearer (the jump r = A y - v is positive) and where j is."""
+
+    i: Tensor
+    j: Tensor
+
+    def of(self, r: Tensor) -> Tensor:
+        """Of the jumps r."""
+        return torch.where(r > 0, self.i, self.j)
+
+
+class Problem(NamedTuple):
+    """A field in depths of pixels, in float64.
+
+    Attributes:
+        m: the ends.
+        phi: features.
+        noise: (N,) of the normals that came, in radians.
+        anchor: (N, 1, H, W) depths, or None.
+        anchor_weight: (N, 1, H, W), or None.
+        steps: sides of a pixel.
+    """
+
+    m: Measured
+    phi: Tensor
+    noise: Tensor
+    anchor: Tensor | None
+    anchor_weight: Tensor | None
+    steps: tuple[float, float]
+
+    @classmethod
+    def of(cls, m: Measured, noise: Tensor, fields: Fields) -> Problem:
+        """The problem of what was measured, with the anchors of the fields."""
+        size = m.v[:, :1]
+        anchor, weight = (None if f is None else f.expand_as(size) for f in (fields.anchor, fields.anchor_weight))
+        return cls(m, features(m), noise, anchor, weight, fields.steps)
+
+    def slopes(self, y: Tensor) -> Tensor:
+        """(N, 2, H, W) those of a depth, 0 where there is no edge."""
+        return torch.where(self.m.live, GradientOperator("forward", self.steps)(y), 0)
+
+    def jumps(self, y: Tensor) -> Tensor:
+        """(N, 2, H, W) how much more a depth grows along the edges than measured."""
+        return self.slopes(y) - self.m.v
+
+    def solve(self, w: Tensor, v: Tensor | None = None, y: Tensor | None = None) -> Tensor:
+        """The minimum of sum w (A y - v)^2 and of the anchors; what is loose is held at y, or at 0."""
+        v, w = self.m.v if v is None else v, w * self.m.trust
+        b = w * (v if y is None else v - self.slopes(y))
+        b = GradientOperator("forward", self.steps).adjoint(b)
+        r = torch.where(edge_ends(w) > 0, _HOLD * _per_surface(w.flatten(1).amax(1)), 0)
+        if self.anchor is not None and self.anchor_weight is not None:
+            b = b + self.anchor_weight * (self.anchor if y is None else self.anchor - y)
+            r = r + self.anchor_weight
+        x = factor(w, r, self.steps).solve(b)
+        return x if y is None else y + x
+
+
+def _per_surface(x: Tensor) -> Tensor:
+    """(N,) as (N, 1, 1, 1)."""
+    return x[:, None, None, None]
+
+
+def odds(problem: Problem, y: Tensor | None = None, widen: float = 1.0) -> Tensor:
+    """(N, 2, 2, H, W) log odds of a cut; with what is cut around at y, damped."""
+    alone = log_odds(problem.phi, problem.noise)
+    if y is None:
+        return alone
+    around = continued(cut_probability(problem, y, widen), problem.m.live)
+    return (1 - _DAMPING) * alone + _DAMPING * log_odds(problem.phi, problem.noise, around)
+
+
+def cut_probability(problem: Problem, y: Tensor, widen: float = 1.0) -> Tensor:
+    """(N, 2, H, W), r^2 / (r^2 + s^2)."""
+    square = problem.jumps(y).square()
+    return square / (square + (widen * problem.m.scale).square())
+
+
+def costs(problem: Problem, log_odds_: Tensor, widen: float = 1.0) -> Costs:
+    """What a cut costs: minus its log probability, and what placing it anywhere in the range costs."""
+    p = log_odds_.sigmoid().clamp(1e-6, 1 - 1e-3)
+    none = (1 - p.sum(1, keepdim=True)).clamp(min=1e-3)
+    spread = math.log(_RANGE) - (widen * problem.m.scale).log()[:, None] - 1
+    return Costs(*((none / p).log() + spread).clamp(0.2, 12).unbind(1))
+
+
+def energy(problem: Problem, y: Tensor, cost: Costs) -> Tensor:
+    """(N,) sum of cost r^2 / (r^2 + s^2)."""
+    r = problem.jumps(y)
+    return (problem.m.live * cost.of(r) * r.square() / (r.square() + problem.m.scale.square())).flatten(1).sum(1)
+
+
+def robust_weights(problem: Problem, y: Tensor, cost: Costs, widen: float = 1.0) -> Tensor:
+    """(N, 2, H, W) weights of the quadratic that touches the energy of scales `widen` s at y."""
+    r = problem.jumps(y)
+    s = widen * problem.m.scale
+    bent = (s.square() / (s.square() + r.square())).square().clamp(min=_LEAST)
+    return cost.of(r) * bent * (_per_surface(problem.m.scale.flatten(1).amin(1)) / s).square()
+
+
+def robust(problem: Problem, y: Tensor, cost: Costs, widths: Iterable[float]) -> Tensor:
+    """One reweighted solve for each factor of the scale."""
+    for widen in widths:
+        y = problem.solve(robust_weights(problem, y, cost, widen), y=y)
+    return y
+
+
+def coupled(problem: Problem, y: Tensor, widths: Iterable[float] = (4, 2, 1, 1), each: int = 2) -> Tensor:
+    """Graduated steps whose costs are those of contours that go on, seen at the present height."""
+    for widen in widths:
+        cost = costs(problem, odds(problem, y, widen), widen)
+        y = robust(problem, y, cost, [widen] * each)
+    return y
+
+
+def opened(problem: Problem, likely: float = 0.02) -> Tensor:
+    """Least squares with weight (1 + (P / likely)^2)^-2: every edge that may be cut, whichever way, is nearly so."""
+    p = odds(problem).sigmoid().sum(1)
+    return problem.solve((1 + (p / likely).square()).square().reciprocal().clamp(min=1e-6))
+
+
+def bilateral(problem: Problem, n_iter: int = 15, k: float = 2.0) -> Tensor:
+    """One-sided trusts, as in `Bilateral`."""
+    m = problem.m
+    square = m.facing.square()
+    side = torch.full_like(square, 0.5)
+    y: Tensor | None = None
+    for _ in range(n_iter):
+        w = side * square
+        total = w.sum(1)
+        v = (w * m.slopes).sum(1) / total.clamp(min=1e-30)
+        y = problem.solve(total.clamp(min=1e-8), v, y)
+        d = problem.slopes(y).square()
+        x_side, y_side = d[:, 0], d[:, 1]
+        before = torch.stack([pad(x_side[..., :-1], (1, 0)), pad(y_side[:, :-1], (0, 0, 1, 0))], 1)
+        after = torch.stack([pad(x_side[..., 1:], (0, 1)), pad(y_side[:, 1:], (0, 0, 0, 1))], 1)
+        side = torch.sigmoid(k * square * (torch.stack([before, after], 1) - d[:, None]))
+    assert y is not None
+    return y
+
+
+def posterior(problem: Problem, y: Tensor) -> Tensor:
+    """(N, 2, H, W) probability that an edge is cut at y, 0 where there is none.
+
+    The odds of its side being nearer, with the contours around, times what the jump r itself says: density 1 / range if
+    cut, s / (pi (s^2 + r^2)) if not.
+    """
+    r, s = problem.jumps(y), problem.m.scale
+    i, j = odds(problem, y).unbind(1)
+    likelihood = (math.pi * (s.square() + r.square()) / (s * _RANGE)).log()
+    return torch.where(problem.m.live, (torch.where(r > 0, i, j) + likelihood).sigmoid(), 0)
+
+
+def out_of_order(problem: Problem, y: Tensor) -> Tensor:
+    """(N,) share of the jumps above two pixels for which it was more likely, e times, that the other side is nearer."""
+    r = problem.jumps(y)
+    i, j = odds(problem).unbind(1)
+    cut = problem.m.live & (r.abs() > _JUMP) & (r.abs() > problem.m.scale)
+    wrong = cut & (torch.where(r > 0, j - i, i - j) > 1)
+    return wrong.flatten(1).sum(1) / cut.flatten(1).sum(1).clamp(min=1)
+
+
+class Found(NamedTuple):
+    """What the search found: depth (N, 1, H, W), weights but for the trusts, probability of a cut (N, 2, H, W)."""
+
+    y: Tensor
+    weight: Tensor
+    cut: Tensor
+
+
+def search(problem: Problem) -> Found:
+    """The two starts, the steps from them, and the choice.
+
+    Where all that may be cut starts open, jumps are found best, but what hangs together by nothing lies anywhere.
+    Where rims or ties tell the order of the sides, few jumps contradict it; where many do, the one-sided trusts are the
+    safer guess. Otherwise the energy decides. Where the surface jumps, the second start tells in any case.
+    """
+    plain = costs(problem, odds(problem))
+    safe = robust(problem, bilateral(problem), plain, [1.0] * 6)
+    bold = coupled(problem, opened(problem))
+    lower = energy(problem, bold, plain) < _CLEARLY * energy(problem, safe, plain)
+    y = torch.where(_per_surface(lower & (out_of_order(problem, bold) < _DISORDER)), bold, safe)
+    cost = costs(problem, odds(problem, y))
+    return Found(y, robust_weights(problem, y, cost), posterior(problem, bold))
