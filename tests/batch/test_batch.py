@@ -55,7 +55,7 @@ def test_grouping_readers_and_threads_change_nothing(folder, capsys):
     assert "7 done, 0 kept, 0 failed" in capsys.readouterr().out
     assert run(folder, "--memory", 1e-5, "--workers", 0, out="alone") == found
     assert {line["together"] for line in lines(folder / "alone")} == {1}
-    assert run(folder, "--workers", 2, "--threads", 2, "--quiet", out="readers") == found
+    assert run(folder, "--workers", 2, "--threads", 0, "--quiet", out="readers") == found
     capsys.readouterr()
 
 

@@ -7,7 +7,7 @@ import torch
 
 from tests.helpers.maps import slopes
 from torchdls import DLS, HarkerOLeary, LeastSquares, SlopeDLS
-from torchdls.batch.lots import ENOUGH, in_lots, most_together, same_bits, same_bits_threaded
+from torchdls.batch.lots import ENOUGH, in_lots, most_together, same_bits
 from torchdls.batch.many import Member, together
 
 CHEAP = [LeastSquares(), LeastSquares(pixel_size=(2.0, 0.5))]
@@ -59,24 +59,6 @@ def test_a_lot_that_has_other_bits_is_not_trusted():
             assert {result.together for result in found} == {6 if trust else 1}
             for member, result in zip(members, found, strict=True):
                 assert torch.equal(result.height, integrator.solve(member.gradient).height[0])
-
-
-@pytest.mark.parametrize("size", [(512, 520), (300, 1100)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_threads_change_no_bit_of_full_rectangles(size, dtype):
-    integrator = LeastSquares()
-    assert same_bits_threaded(integrator)
-    assert not same_bits_threaded(DLS())
-    g, found = noise(1, size[0], size[1], dtype), []
-    before = torch.get_num_threads()
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            found.append(integrator.solve(g).height.detach())
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(found[0], found[1])
-    assert torch.equal(found[0], found[2])
 
 
 def test_lots_are_of_one_kind_and_full():

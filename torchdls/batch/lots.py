@@ -26,12 +26,8 @@ def same_bits(integrator: Integrator, size: Sequence[int]) -> bool:
     the bits of 5 surfaces in 30, and gains little). Found by trial (not one in 19,558 surfaces differed), kept by
     `tests/batch/test_bits.py`, and tried anew in every process (`together`).
     """
-    return same_bits_threaded(integrator) and not any(n % _STEP or n > MATRIX_LIMIT for n in size)
-
-
-def same_bits_threaded(integrator: Integrator) -> bool:
-    """Whether full rectangles have the same bits for any number of threads: no sum runs over a surface."""
-    return type(integrator) is LeastSquares and integrator.boundary == "neumann"
+    plain = type(integrator) is LeastSquares and integrator.boundary == "neumann"
+    return plain and not any(n % _STEP or n > MATRIX_LIMIT for n in size)
 
 
 def most_together(pixels: int, memory: int, exact: bool = True) -> int:

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from torchdls.batch.claims import Claims
-from torchdls.batch.lots import BYTES_AT_REST, in_lots, same_bits_threaded
+from torchdls.batch.lots import BYTES_AT_REST, in_lots
 from torchdls.batch.many import Integrated, Member, Trusted, lot_key, together
 from torchdls.batch.maps import Manner, Map, read_map, write_map
 from torchdls.batch.plan import Job
@@ -44,8 +44,7 @@ class Setting:
         overwrite: do all maps of the own share anew.
         memory: bytes for what waits, is in work and is being written, beside what one large map needs.
         workers: processes that read; 0 to read in this one.
-        threads: for large maps whose bits do not depend on them; all others have one.
-        any_bits: threads for all large maps, even if they change bits.
+        threads: for large maps, whose bits depend on them; small ones have one.
         use_threads: sets the number of threads.
         rank: which of the processes this is.
         world: how many there are.
@@ -59,7 +58,6 @@ class Setting:
     memory: int = 2**30
     workers: int = 0
     threads: int = 1
-    any_bits: bool = False
     use_threads: Callable[[int], None] = lambda n: None
     rank: int = 0
     world: int = 1
@@ -242,9 +240,8 @@ class Run:
         """Sends the results of a lot to be written."""
         maps = {read.number: _content(read) for read in lot}
         first = _content(lot[0])
-        method, whole = self._method(first), first.mask is None and first.weight is None
-        large = _pixels(lot[0]) >= LARGE and (self.setting.any_bits or (whole and same_bits_threaded(method)))
-        threads = self.setting.threads if large else 1
+        method = self._method(first)
+        threads = self.setting.threads if _pixels(lot[0]) >= LARGE else 1
         self.setting.use_threads(threads)
         members = [Member(i, of.gradient, of.mask, of.weight) for i, of in maps.items()]
         for result, _ in together(members, method, self._kind(lot[0]), self._trusted):

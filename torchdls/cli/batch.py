@@ -46,8 +46,8 @@ def add_batch(commands: Any) -> None:
     add("--memory", type=float, default=1.0, metavar="GB", help="for maps that wait, in work or being written, "
         "beside what one large map needs (default: 1)")  # fmt: skip
     add("--workers", type=int, metavar="N", help="processes that read (default: the cores of this process, less one)")
-    add("--threads", type=int, metavar="N", help="for large maps, whose bits may depend on it (default: 1, but the cores "
-        "of this process for full maps by least_squares, whose bits do not); small maps take one")  # fmt: skip
+    add("--threads", type=int, default=1, metavar="N", help="for maps from 512 x 512 pixels on, whose last bits depend "
+        "on it; 0 is the cores of this process (default: 1: start one process for each core)")  # fmt: skip
     add("--claim-age", type=float, default=120.0, metavar="S", help="seconds without a sign of life after which a "
         "process on another machine is gone (default: 120)")  # fmt: skip
     add("--quiet", action="store_true", help="no progress and no summary")
@@ -82,9 +82,8 @@ def _setting(arguments: argparse.Namespace) -> Setting:
         raise ValueError(f"--memory {arguments.memory:g}, --claim-age {arguments.claim_age:g}: both must be positive")
     cores = max(1, _cores() // _count("LOCAL_WORLD_SIZE", world))
     workers = min(4, cores - 1) if arguments.workers is None else arguments.workers
-    threads = min(cores, _most_threads()) if arguments.threads is None else arguments.threads
-    if workers < 0 or threads < 1:
-        raise ValueError(f"--workers {workers}, --threads {threads}: at least 0 and 1 are needed")
+    if workers < 0 or arguments.threads < 0:
+        raise ValueError(f"--workers {workers}, --threads {arguments.threads}: at least 0 is needed")
     return Setting(
         manner(arguments),
         arguments.method,
@@ -92,8 +91,7 @@ def _setting(arguments: argparse.Namespace) -> Setting:
         overwrite=arguments.force,
         memory=int(arguments.memory * 2**30),
         workers=workers if hasattr(os, "fork") else 0,
-        threads=threads,
-        any_bits=arguments.threads is not None,
+        threads=arguments.threads or cores,
         use_threads=_use_threads,
         rank=rank,
         world=world,
@@ -119,12 +117,6 @@ def _count(name: str, default: int) -> int:
 def _cores() -> int:
     """The cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _most_threads() -> int:
-    """What OMP_NUM_THREADS says, unless torchrun set it."""
-    said = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]
-    return int(said) if said.isdigit() and int(said) and "TORCHELASTIC_RUN_ID" not in os.environ else _cores()
 
 
 def _jobs(arguments: argparse.Namespace) -> list[Job]:
@@ -178,8 +170,7 @@ def _check_asked(arguments: argparse.Namespace, state: Path) -> None:
 
 def _how(setting: Setting) -> str:
     rank = "" if setting.world == 1 else f"rank {setting.rank} of {setting.world}, "
-    which = "" if setting.any_bits else "full " if setting.method == "least_squares" else None
-    large = f", {setting.threads} for large {which}maps" if setting.threads > 1 and which is not None else ""
+    large = f", {setting.threads} for large maps" if setting.threads > 1 else ""
     return f"{rank}1 thread{large}, {setting.workers} readers, {setting.memory / 2**30:.3g} GB for maps in work"
 
 
