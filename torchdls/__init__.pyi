@@ -1,5 +1,6 @@
 """The public names and where they live: the one list, for `import torchdls` (see `__init__.py`) and type checkers."""
 
+from . import large as large
 from .batch import Integrated as Integrated
 from .batch import integrate_many as integrate_many
 from .dictionary import KSVD as KSVD

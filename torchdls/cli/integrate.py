@@ -38,6 +38,8 @@ def add_integrate(commands: Any) -> None:
     add("--set", action="append", default=[], metavar="NAME=VALUE", help="option of the method, such as lam=0.5")
     add("--mask", metavar="FILE", help="image or array; white or nonzero is valid")
     add_manner(command)
+    add("--tile", type=int, metavar="N", help="least_squares of a full NPY, Zarr or TIFF of floats, larger than memory "
+        "if need be, N rows or columns at a time, to NPY, Zarr or BigTIFF")  # fmt: skip
     add("--force", action="store_true", help="replace output files that exist")
     add("--quiet", action="store_true", help="no progress bar and no report")
     command.set_defaults(run=_integrate)
@@ -81,6 +83,8 @@ def _integrate(arguments: argparse.Namespace) -> None:
     from torchdls.batch import read_map, write_map
     from torchdls.io.packing import describe
 
+    if arguments.tile is not None:
+        return _integrate_large(arguments)
     check_method(arguments.method, arguments.set)  # what would fail after the work shall fail before it
     for path in arguments.out:
         check_output(path, arguments.force, suffixes=io.OUTPUT_SUFFIXES)
@@ -104,6 +108,25 @@ def _integrate(arguments: argparse.Namespace) -> None:
         pixels = f"{int(found.mask.sum())} of {h * w} pixels" if found.mask is not None else f"{h} x {w} pixels"
         level = "" if noise is None else f", noise {float(noise):.3g} in the slopes,"
         print(f"{arguments.method}: {pixels}{level} in {seconds:.2f} s -> {', '.join(arguments.out)}")
+
+
+def _integrate_large(arguments: argparse.Namespace) -> None:
+    """Least squares out of core."""
+    from torchdls import large
+
+    if arguments.method != "least_squares" or arguments.set:
+        raise ValueError("--tile: least_squares alone, without options, is done in tiles")
+    for name in ("mask", "camera", "channels"):
+        if getattr(arguments, name) is not None:
+            raise ValueError(f"--tile: full rectangles alone are done in tiles, --{name} is given")
+    if arguments.float64 or len(arguments.out) > 1:
+        raise ValueError("--tile: in the precision of the input and to one output; --float64 or several -o are given")
+    start, size = time.perf_counter(), _pixel_size(arguments.pixel_size) or 1.0
+    options = {"convention": arguments.convention, "tile": arguments.tile, "overwrite": arguments.force}
+    result = large.integrate(arguments.input, arguments.out[0], pixel_size=size, **options)
+    if not arguments.quiet:
+        (h, w), seconds = result.shape, time.perf_counter() - start
+        print(f"least_squares: {h} x {w} pixels in {seconds:.2f} s -> {arguments.out[0]}")
 
 
 def _source(arguments: argparse.Namespace) -> Source:
