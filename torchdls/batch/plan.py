@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from torchdls.batch.maps import MASK, Source, folder_source
+from torchdls.batch.stores import find_in_store, is_url
 from torchdls.io.formats import SIGNATURES
 
 
@@ -27,7 +28,7 @@ def find_maps(inputs: Sequence[str], *, leave_out: str | None = None) -> list[tu
     below that; a folder with normal_map.png by itself.
 
     Args:
-        inputs: files, folders and patterns.
+        inputs: files, folders and patterns; files and folders in stores by their URL.
         leave_out: a folder that is not looked into: that of the results.
 
     Raises:
@@ -37,7 +38,9 @@ def find_maps(inputs: Sequence[str], *, leave_out: str | None = None) -> list[tu
     hidden = None if leave_out is None else os.path.realpath(leave_out)
     found: list[tuple[str, Source]] = []
     for given in inputs:
-        if os.path.isdir(given):
+        if is_url(given):
+            found += find_in_store(given)
+        elif os.path.isdir(given):
             inside = list(_in_folder(given, hidden))
             if not inside:
                 raise ValueError(f"{given}: holds no map: neither normal_map.png nor a file that can be read")

@@ -24,6 +24,7 @@ from torchdls.batch.many import Integrated, Member, Trusted, lot_key, together
 from torchdls.batch.maps import Manner, Map, read_map, write_map
 from torchdls.batch.plan import Job
 from torchdls.batch.report import DONE, FAILED, KEPT, Progress, Report
+from torchdls.batch.stores import exists, fetched, placed
 from torchdls.integrators import Integrator
 
 # Files read by a worker at a time: so many, or so many bytes.
@@ -83,7 +84,8 @@ class _Files(Dataset[list[Any]]):
 
     def _read(self, index: int) -> _Read:
         try:
-            return _Read(index, read_map(self.jobs[index].source, self.manner))
+            with fetched(self.jobs[index].source) as source:
+                return _Read(index, read_map(source, self.manner))
         except (ValueError, TypeError, OSError, ImportError, MemoryError) as error:
             return _Read(index, None, reason_of(error))
 
@@ -174,7 +176,7 @@ class Run:
     def _is_done(self, index: int) -> bool:
         if self.setting.overwrite:
             return index in self._finished
-        return all(os.path.lexists(output) for output in self.jobs[index].outputs)
+        return all(exists(output) for output in self.jobs[index].outputs)
 
     def _drawn(self, indices: Iterable[int], own: bool) -> Iterator[int]:
         """The maps that this process now holds."""
@@ -256,9 +258,9 @@ class Run:
         assert result.height is not None
         try:
             for output in job.outputs:
-                os.makedirs(os.path.dirname(output), exist_ok=True)
-                if self.setting.overwrite or not os.path.lexists(output):
-                    write_map(output, result.height[None], of, overwrite=self.setting.overwrite)
+                if self.setting.overwrite or not exists(output):
+                    with placed(output) as here:
+                        write_map(here, result.height[None], of, overwrite=self.setting.overwrite)
         except FileExistsError:  # another process was faster, where claims do not reach it
             self.claims.succeed(job.name)
             self._tell(result.number, KEPT)

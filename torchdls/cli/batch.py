@@ -43,6 +43,8 @@ def add_batch(commands: Any) -> None:
     )
     add("--report", metavar="FILE", help="a line of JSON for each map is added to it (default: report.jsonl in DIR; "
         "process N of several writes report-N.jsonl)")  # fmt: skip
+    add("--state", metavar="DIR", help="folder for claims, on disks that all processes share (default: .torchdls in the "
+        "folder for results; needed where that is in a store, such as s3://bucket/surfaces)")  # fmt: skip
     add("--memory", type=float, default=1.0, metavar="GB", help="for maps that wait, in work or being written, "
         "beside what one large map needs (default: 1)")  # fmt: skip
     add("--workers", type=int, metavar="N", help="processes that read (default: the cores of this process, less one)")
@@ -59,17 +61,30 @@ def _batch(arguments: argparse.Namespace) -> int:
 
     check_method(arguments.method, arguments.set)
     setting = _setting(arguments)
+    state = _state(arguments)
     jobs = _jobs(arguments)
-    out = Path(arguments.out)
-    out.mkdir(parents=True, exist_ok=True)
-    report = _report_path(arguments, setting)
-    _check_asked(arguments, out / STATE)
+    state.mkdir(parents=True, exist_ok=True)
+    report = _report_path(arguments, state, setting)
+    _check_asked(arguments, state)
     share = len(range(setting.rank, len(jobs), setting.world))
     progress = Progress(share, arguments.quiet)
-    with Claims(out / STATE, setting.age) as claims, Report(report) as lines:
+    with Claims(state, setting.age) as claims, Report(report) as lines:
         _say(arguments, f"{len(jobs)} maps, {_how(setting)}")
         left = Run(jobs, setting, claims, lines, progress).all()
     return _end(arguments, progress, report, left)
+
+
+def _state(arguments: argparse.Namespace) -> Path:
+    """The folder for claims, which must make files exclusively: not one in a store."""
+    from torchdls.batch.stores import is_url
+
+    if arguments.state is not None:
+        return Path(arguments.state)
+    if is_url(arguments.out):
+        raise ValueError(
+            f"--out: {arguments.out} is in a store; --state DIR, on disks that all processes share, is needed"
+        )
+    return Path(arguments.out, STATE)
 
 
 def _setting(arguments: argparse.Namespace) -> Setting:
@@ -138,8 +153,9 @@ def _jobs(arguments: argparse.Namespace) -> list[Job]:
     return plan(found, arguments.out, list(dict.fromkeys(suffixes)))
 
 
-def _report_path(arguments: argparse.Namespace, setting: Setting) -> Path:
-    path = Path(arguments.out, "report.jsonl") if arguments.report is None else Path(arguments.report)
+def _report_path(arguments: argparse.Namespace, state: Path, setting: Setting) -> Path:
+    beside = Path(arguments.out) if state == Path(arguments.out, STATE) else state
+    path = beside / "report.jsonl" if arguments.report is None else Path(arguments.report)
     return path if setting.world == 1 else path.with_name(f"{path.stem}-{setting.rank}{path.suffix}")
 
 
@@ -149,7 +165,6 @@ def _check_asked(arguments: argparse.Namespace, state: Path) -> None:
 
     names = ("method", "set", "channels", "convention", "pixel_size", "camera", "float64")
     asked = {name: getattr(arguments, name) for name in names}
-    state.mkdir(exist_ok=True)
     place = state / "asked.json"
     if not place.exists() or arguments.force:
         try:
