@@ -43,8 +43,8 @@ def add_batch(commands: Any) -> None:
     )
     add("--report", metavar="FILE", help="a line of JSON for each map is added to it (default: report.jsonl in DIR; "
         "process N of several writes report-N.jsonl)")  # fmt: skip
-    add("--state", metavar="DIR", help="folder for claims, on disks that all processes share (default: .torchdls in the "
-        "folder for results; needed where that is in a store, such as s3://bucket/surfaces)")  # fmt: skip
+    add("--state", metavar="DIR", help="folder for claims, on disks that all processes share (default: .torchdls in "
+        "the folder for results; needed where that is in a store, such as s3://bucket/surfaces)")  # fmt: skip
     add("--memory", type=float, default=1.0, metavar="GB", help="for maps that wait, in work or being written, "
         "beside what one large map needs (default: 1)")  # fmt: skip
     add("--workers", type=int, metavar="N", help="processes that read (default: the cores of this process, less one)")
