@@ -108,7 +108,9 @@ def _results(
     def kind(member: Member) -> Hashable | None:
         return lot_key(member, integrator, exact)
 
-    for lot in in_lots(_members(dataset), kind, lambda member: member.gradient[0, 0].numel(), memory, exact):
+    for lot in in_lots(
+        _members(dataset), kind, lambda member: member.gradient.shape[-2] * member.gradient.shape[-1], memory, exact
+    ):
         for result, error in together(lot, integrator, kind(lot[0]), trusted):
             if error is not None and errors == "raise":
                 raise error
@@ -182,10 +184,8 @@ def integrate_lot(lot: Sequence[Member], integrator: Integrator) -> list[tuple[I
             return [result for member in lot for result in integrate_lot([member], integrator)]
         return [(Integrated(lot[0].key, None, error=" ".join(str(error).split()) or type(error).__name__), error)]
     seconds = (time.perf_counter() - start) / len(lot)
-    results = [
-        Integrated(member.key, found.height[k], *_told(found._asdict(), k), seconds, len(lot))
-        for k, member in enumerate(lot)
-    ]
+    parts = zip(lot, found.height.unbind(), _told(found._asdict(), len(lot)), strict=True)
+    results = [Integrated(member.key, height, *told, seconds, len(lot)) for member, height, told in parts]
     return [(result, None) for result in results]
 
 
@@ -196,16 +196,16 @@ def _stacked(parts: list[Tensor | None]) -> Tensor | None:
     return first if len(parts) == 1 else torch.cat([part for part in parts if part is not None])
 
 
-def _told(found: Mapping[str, Any], k: int) -> tuple[float | None, int | None, bool | None]:
-    """Noise, iterations and convergence of one surface, as far as the method tells them."""
-    noise, iterations, converged = (found.get(name) for name in ("noise", "iterations", "converged"))
-    if iterations is None and "misfit" in found:
-        iterations = torch.full((len(found["misfit"]),), found["misfit"].shape[1] - 1)
-    return (
-        None if noise is None else float(noise[k]),
-        None if iterations is None else int(iterations[k]),
-        None if converged is None else bool(converged[k]),
-    )
+def _told(found: Mapping[str, Any], n: int) -> list[tuple[float | None, int | None, bool | None]]:
+    """Noise, iterations and convergence of each surface, as far as the method tells them."""
+    noise, iterations, converged = (_listed(found.get(name), n) for name in ("noise", "iterations", "converged"))
+    if "iterations" not in found and "misfit" in found:
+        iterations = [found["misfit"].shape[1] - 1] * n
+    return list(zip(noise, iterations, converged, strict=True))
+
+
+def _listed(values: Tensor | None, n: int) -> list[Any]:
+    return [None] * n if values is None else values.tolist()
 
 
 def _members(dataset: Iterable[Any]) -> Iterator[Member]:

@@ -303,4 +303,5 @@ def _content(read: _Read) -> Map:
 
 
 def _pixels(read: _Read) -> int:
-    return _content(read).gradient[0, 0].numel()
+    h, w = _content(read).gradient.shape[-2:]
+    return h * w

@@ -57,7 +57,7 @@ def find_in_store(url: str) -> list[tuple[str, Source]]:
     return [
         (
             (name[len(base) :].strip("/") or PurePosixPath(base).name),
-            Source(*(part and store.unstrip_protocol(part) for part in source)),
+            Source._make(part and store.unstrip_protocol(part) for part in source),
         )
         for name, source in maps
     ]
