@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import threading
 import time
 import warnings
 from collections import deque
@@ -208,7 +209,7 @@ class Run:
 
     def _read(self, drawn: Iterable[int]) -> Iterator[_Read]:
         setting = self.setting
-        options = {"prefetch_factor": 2, "worker_init_fn": lambda _: self.claims.forget()} if setting.workers else {}
+        options = {"prefetch_factor": 2, "worker_init_fn": self._begin_reading} if setting.workers else {}
         loader = DataLoader(
             _Files(self.jobs, setting.manner),
             batch_size=None,
@@ -227,6 +228,11 @@ class Run:
                     self._fail(index, reason)
                 else:
                     yield _Read(index, Map(*map(_as_tensor, content)))
+
+    def _begin_reading(self, number: int) -> None:
+        """In a reader: it neither keeps the claims of its parent nor outlives it, waiting to hand over what it read."""
+        self.claims.forget()
+        threading.Thread(target=_follow, args=(os.getppid(),), daemon=True).start()
 
     def _method(self, of: Map) -> Integrator:
         if of.pixel_size not in self._made:
@@ -295,6 +301,12 @@ class Run:
         outputs = [] if status == FAILED else list(job.outputs)
         self.report.line(status=status, input=job.source.path, output=outputs, rank=self.setting.rank, **more)
         self.progress.count(status, more.get("reason", ""))
+
+
+def _follow(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
 
 
 def _content(read: _Read) -> Map:
