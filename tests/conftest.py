@@ -2,6 +2,8 @@
 
 import os
 
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as in the command line: threads that wait sleep
+
 import pytest
 import torch
 

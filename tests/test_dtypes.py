@@ -72,6 +72,7 @@ CALLS = {
     "normal_noise": NORMALS,
     "normals_to_gradient": NORMALS,
     "orthogonal_matching_pursuit": {**patches(), "mu": torch.ones(1, 1), "tol": torch.ones(1, 1)},
+    "reconstruct": NORMALS | {"method": "least_squares"},
     "refine": {"height": field(1), **PHOTOMETRIC, "albedo": field(1), "n_iter": 1},
     "render": {"normals": field(3), "lights": lights(), "albedo": field(1), "shadow": mask()},
     "ring_of_lights": {},

@@ -64,6 +64,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "orthogonal_matching_pursuit": (lambda p, d: orthogonal_matching_pursuit(p, d, 3), P, D),
     "Patches": (Patches(4, 2).extract, z),
     "Patches.adjoint": (lambda x: Patches(3, 3).adjoint(x, (12, 15)), P),
+    "reconstruct": (lambda n: torchdls.reconstruct(n, method="least_squares").height, n),
     "refine": (lambda z, i, k: torchdls.refine(z, i, k, n_iter=2).height, z[..., :6, :5], images, lights),
     "render": (torchdls.render, n, lights),
     "rmse": (torchdls.rmse, z, z.square()),
@@ -82,7 +83,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
 }  # fmt: skip
 # What takes no tensor, gives no tensor, reads or draws a file, or is tested over its registry.
 OTHERS = {
-    "ring_of_lights", "dct_dictionary", "terrain", "guess_convention", "build", "load", "save", "load_camera",
+    "integrate_many", "ring_of_lights", "dct_dictionary", "terrain", "guess_convention", "build", "load", "save", "load_camera",
     "load_field", "load_height", "load_mask", "load_photographs", "save_normals", "save_height", "save_mesh",
     "compare_heights", "hillshade", "page_html", "surface_page",
 }  # fmt: skip

@@ -1,5 +1,8 @@
 """The public names and where they live: the one list, for `import torchdls` (see `__init__.py`) and type checkers."""
 
+from . import large as large
+from .batch import Integrated as Integrated
+from .batch import integrate_many as integrate_many
 from .dictionary import KSVD as KSVD
 from .dictionary import LEARNERS as LEARNERS
 from .dictionary import DinoKat as DinoKat
@@ -95,6 +98,8 @@ from .plot import compare_heights as compare_heights
 from .plot import hillshade as hillshade
 from .plot import page_html as page_html
 from .plot import surface_page as surface_page
+from .reconstruction import Reconstruction as Reconstruction
+from .reconstruction import reconstruct as reconstruct
 from .selection import Selection as Selection
 from .selection import select as select
 from .solvers import ConvergenceWarning as ConvergenceWarning

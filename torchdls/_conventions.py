@@ -22,3 +22,5 @@ GRADIENT_CONVENTIONS: dict[str, Axes] = {
     "depth": ((0, -1), (1, -1)),  # depth (distance, grows away): to the right, down
     "matlab": ((1, 1), (0, 1)),  # height: down the rows, along the columns
 }
+
+AUTO = "auto"  # asks for the most integrable reading of a normal map

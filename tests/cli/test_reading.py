@@ -218,7 +218,7 @@ def test_every_convention_is_tried():
 
 @pytest.mark.parametrize("perspective", [False, True])
 def test_a_large_map_is_judged_by_tiles_as_it_is_as_a_whole(perspective):
-    from torchdls.cli.reading import _tiles
+    from torchdls.io.reading import _tiles
 
     k = torch.tensor([[900.0, 0, 300], [0, 900, 200], [0, 0, 1]], dtype=torch.float64) if perspective else None
     y, x = torch.meshgrid(*(torch.arange(d, dtype=torch.float64) for d in (400, 520)), indexing="ij")

@@ -1,4 +1,4 @@
-"""The command line: `torchdls integrate`, `torchdls photometric`, `torchdls demo`, `torchdls methods`.
+"""The command line: `torchdls integrate`, `batch`, `photometric`, `demo`, `methods`.
 
 PyTorch is imported when a command runs, so `torchdls --help` answers at once. Whatever is wrong with a file or an
 argument is one line on standard error and exit status 2; output files are written whole or not at all.
@@ -11,17 +11,13 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from torchdls import __version__
+from torchdls.cli.batch import add_batch
 from torchdls.cli.demo import add_demo
 from torchdls.cli.integrate import add_integrate
 from torchdls.cli.methods import list_methods
 from torchdls.cli.photometric import add_photometric
-
-if TYPE_CHECKING:
-    pass
-
 
 _EXAMPLES = """\
 examples:
@@ -30,16 +26,19 @@ examples:
   torchdls integrate gradient.npz --method least_squares -o height.npz
   torchdls integrate normals.png --convention opencv --camera K.txt -o depth.tiff
   torchdls photometric photographs --normals normals.png -o surface.ply
+  torchdls batch maps/ --out surfaces --format npz,ply --convention directx
 """
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0, 2 for bad input, 130 when interrupted."""
+    """Run the command line; returns the exit status: 0, 1 if maps failed, 2 for bad input, 130 when interrupted."""
+    # Threads that wait shall sleep: two processes of two threads on two cores otherwise take many times longer.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read once, when PyTorch is loaded
     arguments = _parser().parse_args(argv)
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
-            arguments.run(arguments)
+            status = int(arguments.run(arguments) or 0)
         sys.stdout.flush()
     except (ValueError, TypeError, OSError, ImportError) as error:
         return _complain(error)
@@ -50,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("torchdls: interrupted", file=sys.stderr)
         return 130
-    return 0
+    return status
 
 
 def _warn(message: Warning | str, *where: object, **more: object) -> None:
@@ -82,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     add_integrate(commands)
     add_photometric(commands)
+    add_batch(commands)
     add_demo(commands)
     methods = commands.add_parser("methods", help="list the methods", description="List the methods and their options.")
     methods.set_defaults(run=list_methods)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import random
 from typing import TYPE_CHECKING, NamedTuple
 
-from torchdls._conventions import NORMAL_CONVENTIONS
+from torchdls._conventions import AUTO, NORMAL_CONVENTIONS
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from torchdls.io import Field
 
-AUTO = "auto"
 _CLEARLY = 2.0  # a reading this many times as integrable as another is worth a word
 _FLAT = 0.02  # residuals below it are rounding, whichever is smaller
 

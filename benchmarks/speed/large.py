@@ -1,0 +1,94 @@
+"""Least squares out of core: `python -m benchmarks.speed.large` (minutes, 4 GB of disk; --smoke, or --sizes 4096 8192).
+
+Time, the largest memory of the process's own (pages of files left out), and the difference from the whole where that is
+made as well (up to 4096 pixels a side).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.common.report import results_folder, write_json
+from benchmarks.common.timing import fresh_process
+from torchdls import LeastSquares, large
+
+
+def own_megabytes() -> float:
+    """What the process holds beside pages of files."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("RssAnon")) / 1024
+
+
+class Watch:
+    """The largest memory while the block runs, looked at twenty times a second."""
+
+    def __enter__(self) -> Watch:
+        self.most, self._stop = 0.0, threading.Event()
+        self._thread = threading.Thread(target=self._look)
+        self._thread.start()
+        return self
+
+    def _look(self) -> None:
+        while not self._stop.wait(0.05):
+            self.most = max(self.most, own_megabytes())
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+def write_field(path: Path, n: int) -> None:
+    """Slopes of waves and hills with noise, written in bands."""
+    field = np.lib.format.open_memmap(path, "w+", np.float32, (2, n, n))
+    x = np.linspace(0, 20, n, dtype=np.float32)
+    for start in range(0, n, 512):
+        y, rng = x[start : start + 512, None], np.random.default_rng(start)
+        field[0, start : start + 512] = np.cos(x) * np.sin(y) + 0.3 * rng.standard_normal((len(y), n), np.float32)
+        field[1, start : start + 512] = np.sin(x) * np.cos(y) + 0.3 * rng.standard_normal((len(y), n), np.float32)
+
+
+def point(n: int, megabytes: int) -> dict[str, Any]:
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        write_field(Path(folder, "g.npy"), n)
+        begin, start = own_megabytes(), time.perf_counter()
+        with Watch() as watch:
+            result = large.integrate(Path(folder, "g.npy"), Path(folder, "z.npy"), memory=megabytes * 2**20)
+        row: dict[str, Any] = {"size": n, "memory": megabytes, "tile": result.tile}
+        row |= {"seconds": time.perf_counter() - start, "own_megabytes": watch.most, "before_megabytes": begin}
+        if n <= 4096:
+            found = np.load(Path(folder, "z.npy"))
+            whole = LeastSquares()(torch.from_numpy(np.load(Path(folder, "g.npy"))))[0].numpy()
+            row["difference"] = float(np.abs(found - whole).max() / np.ptp(whole))
+    return row
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--smoke", action="store_true", help="tiny sizes, to see that it runs")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[2048, 4096, 8192, 16384])
+    parser.add_argument("--memory", type=int, default=1024, help="megabytes (default: 1024)")
+    parser.add_argument("--point", nargs=2, type=int, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.point:
+        print(json.dumps(point(*args.point)))
+        return
+    rows = []
+    for n in [96, 128] if args.smoke else args.sizes:
+        said = fresh_process("benchmarks.speed.large", "--point", str(n), str(1 if args.smoke else args.memory))
+        rows.append(json.loads(said.splitlines()[-1]))
+        print(rows[-1], flush=True)
+    write_json(results_folder(args.smoke) / "large.json", points=rows)
+
+
+if __name__ == "__main__":
+    main()
