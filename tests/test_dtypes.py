@@ -105,6 +105,7 @@ METHODS = {
 # Arguments of no tensor, or tensors of any kind: pages, paths; and these take any number of dimensions from two on.
 NO_TENSORS = {
     "build",
+    "integrate_many",
     "load",
     "load_camera",
     "load_field",

@@ -83,7 +83,8 @@ CALLS: dict[str, tuple[Any, ...]] = {
 }  # fmt: skip
 # What takes no tensor, gives no tensor, reads or draws a file, or is tested over its registry.
 OTHERS = {
-    "integrate_many", "ring_of_lights", "dct_dictionary", "terrain", "guess_convention", "build", "load", "save", "load_camera",
+    "integrate_many",
+    "ring_of_lights", "dct_dictionary", "terrain", "guess_convention", "build", "load", "save", "load_camera",
     "load_field", "load_height", "load_mask", "load_photographs", "save_normals", "save_height", "save_mesh",
     "compare_heights", "hillshade", "page_html", "surface_page",
 }  # fmt: skip
