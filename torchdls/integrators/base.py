@@ -15,10 +15,10 @@ from torch.nn.utils import parametrize
 from torchdls._checks import check_field, require
 from torchdls._options import plain, same, shown
 from torchdls._tracing import all_finite
-from torchdls.integrators.data_term import edge_cost
+from torchdls.integrators.data_term import edge_cost, edges_of
 from torchdls.integrators.fields import Fields as Fields
 from torchdls.integrators.fields import check_accepted, check_values, fit_fields, within_mask
-from torchdls.operators import as_pixel_size, edge_slopes
+from torchdls.operators import as_pixel_size
 
 Callback = Callable[[int, Tensor], None]
 
@@ -188,7 +188,7 @@ class Integrator(nn.Module, ABC):
 
     def edges(self, fields: Fields, z: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         """Slopes v and trusts w of the quadratic 1/2 sum w (A z - v)^2 that stands for the data term around z."""
-        return edge_slopes(fields.gradient, fields.mask, fields.weight)
+        return edges_of(fields)
 
     def data_cost(self, fields: Fields, z: Tensor) -> Tensor:
         """(N,) the data term at z."""

@@ -6,7 +6,9 @@ from typing import Protocol
 
 from torch import Tensor
 
-from torchdls.operators import GradientOperator
+from torchdls.integrators.fields import Fields
+from torchdls.noise import averaging_error
+from torchdls.operators import GradientOperator, edge_slopes
 
 
 class DataTerm(Protocol):
@@ -20,6 +22,14 @@ class DataTerm(Protocol):
 
         The quadratic is 1/2 sum w (A . - v)^2, but for a constant.
         """
+
+
+def edges_of(fields: Fields) -> tuple[Tensor, Tensor | None]:
+    """Slopes v and trusts w on the edges of the grid; weights count beside what averaging itself errs by."""
+    if fields.weight is None:
+        return edge_slopes(fields.gradient, fields.mask)
+    error = averaging_error(fields.gradient, fields.mask, fields.weight, fields.steps)
+    return edge_slopes(fields.gradient, fields.mask, fields.weight, error=error)
 
 
 def edge_cost(z: Tensor, v: Tensor, w: Tensor | None, steps: tuple[float, float]) -> Tensor:

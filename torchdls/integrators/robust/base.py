@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from torchdls.integrators.base import Fields
-from torchdls.integrators.data_term import DataTerm
+from torchdls.integrators.data_term import DataTerm, edges_of
 from torchdls.integrators.iterative import Callback, Iterative
-from torchdls.operators import edge_slopes
 from torchdls.solvers import solve
 
 State = tuple[Tensor, ...]  # the height first, then whatever else an iteration hands to the next; all (N, ...)
@@ -77,7 +76,7 @@ class Robust(Iterative[RobustResult]):
     def edges(self, fields: Fields, z: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         """Slopes v and trusts w of the quadratic that majorises the data term around z (least squares for None)."""
         if z is None:
-            return edge_slopes(fields.gradient, fields.mask, fields.weight)
+            return edges_of(fields)
         return self.data_term(fields).majoriser(z)
 
     def data_cost(self, fields: Fields, z: Tensor) -> Tensor:
@@ -112,7 +111,7 @@ class Robust(Iterative[RobustResult]):
 
     def _begin(self, fields: Fields, data: DataTerm) -> State:
         """Where to start: the least-squares surface."""
-        v, w = edge_slopes(fields.gradient, fields.mask, fields.weight)
+        v, w = edges_of(fields)
         return (self._surface(fields, v, w, fields.anchor_weight),)
 
     def _advance(self, fields: Fields, data: DataTerm, state: State) -> State:

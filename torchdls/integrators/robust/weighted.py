@@ -11,8 +11,8 @@ from torch.nn.functional import pad
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls.integrators.base import Fields
 from torchdls.integrators.classic.least_squares import LeastSquares
+from torchdls.integrators.data_term import edges_of
 from torchdls.integrators.robust.residuals import curl_of, least_slope, present
-from torchdls.operators import edge_slopes
 from torchdls.solvers import SolveResult, solve
 
 
@@ -73,7 +73,7 @@ class WeightedLeastSquares(LeastSquares):
 
     def edges(self, fields: Fields, z: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         """Slopes v and trusts q w; they do not depend on z."""
-        v, w = edge_slopes(fields.gradient, fields.mask, fields.weight)
+        v, w = edges_of(fields)
         w = present(v) if w is None else w
         return v, w * self._trust(fields)
 
