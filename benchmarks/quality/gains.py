@@ -2,9 +2,9 @@
 
 All analytic surfaces and real terrain, several noise levels and draws. SlopeDLS runs as it comes. DLS runs as it comes,
 bare (`select=False`), at the best of a sweep of thresholds, chosen per row with the truth in hand, and with
-`select=True`, which chooses without it. The comparators run at the best of a sweep. A row is a surface at a noise level: the mean error of least
-squares over the mean error of the method. Writes JSON with every row and a Markdown table of geometric means and worst
-rows, and a picture.
+`select=True`, which chooses without it. The comparators run at the best of a sweep. A row is a surface at a noise
+level: the mean error of least squares over the mean error of the method. Writes JSON with every row and a Markdown
+table of geometric means and worst rows, and a picture.
 """
 
 from __future__ import annotations

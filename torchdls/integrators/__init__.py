@@ -23,7 +23,7 @@ from torchdls.integrators.robust import (
     TotalVariation,
     WeightedLeastSquares,
 )
-from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
+from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult, shrink_slow_waves
 
 __all__ = [
     "AnisotropicDiffusion",
@@ -55,4 +55,5 @@ __all__ = [
     "TikhonovRegularization",
     "Unroll",
     "dls_objective",
+    "shrink_slow_waves",
 ]

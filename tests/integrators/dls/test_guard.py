@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from scipy.fft import idctn
+from scipy.fft import dctn, idctn
 
 from tests.helpers import MASKS, assert_gradients, random_field
 from tests.helpers.methods import bumps
@@ -39,21 +39,32 @@ def ramp(x, low, high):
     return min(max((x - low) / (high - low), 0), 1)
 
 
+def share_by_definition(D, within, steps, sigma):
+    """From the four figures of the docstring, mode by mode in NumPy."""
+    S, _ = spectrum(steps)
+    some = S > 0
+
+    def removed(d, p):
+        C = dctn(d[0, 0].numpy(), norm="ortho")
+        return (C[some] ** 2 * S[some] ** -p).sum() / sigma**2 / (S[some] ** (1 - p)).sum()
+
+    found = removed(within, 0.25)
+    share = ramp(found, 0.18, 0.28) * (1 - ramp(removed(within, 0.75) / found, 1.85, 2.2))
+    return share * (1 - ramp(removed(D, 0.25) / found, 1.3, 1.8)) * (1 - ramp(removed(D, 1.0), 1.0, 1.6))
+
+
 @pytest.mark.parametrize("steps", [(1.0, 1.0), (0.5, 2.0)])
-@pytest.mark.parametrize("taken", [0.1, 0.25, 0.5, 0.9, 1.05, 1.3])
-def test_shares_follow_their_definition(taken, steps):
-    """In every mode the same part of the noise is taken, so that no band gives anything back up to taken = 1."""
-    (S, _), sigma, reference = spectrum(steps), 0.7, random_field(1, 1, H, W, seed=2)
-    D = torch.from_numpy(idctn(np.sqrt(taken * S) * sigma, norm="ortho"))[None, None]
-    found = guard_by_modes(reference + D, reference, torch.tensor([sigma], dtype=torch.float64), steps) - reference
-    if taken <= 1:  # q and rho are both `taken`
-        torch.testing.assert_close(found, ramp(taken, 0.18, 0.28) * (1 - ramp(taken, 0.95, 1.2)) * D)
-    else:
-        within = discrepancy_guard(
-            reference + D, reference, torch.tensor([sigma], dtype=torch.float64), steps, allowance=0.0
-        )
-        torch.testing.assert_close(found, (1 - ramp(taken, 0.95, 1.2)) * (within - reference))
-        assert found.norm() < 0.99 * (1 - ramp(taken, 0.95, 1.2)) * D.norm() or taken > 1.2
+@pytest.mark.parametrize("taken, tilt, partly", [(0.1, 0, False), (0.25, 0, True), (0.5, 0, True), (1.2, 0, True),
+                                                (1.5, 0, False), (1.9, 0, False), (0.4, 0.8, True)])  # fmt: skip
+def test_shares_follow_their_definition(taken, tilt, partly, steps):
+    """The same part of the noise is taken from every mode, or more from fine ones."""
+    (S, L), sigma, reference = spectrum(steps), 0.7, random_field(1, 1, H, W, seed=2)
+    D = torch.from_numpy(idctn(np.sqrt(taken * S * (1 + L) ** tilt) * sigma, norm="ortho"))[None, None]
+    noise = torch.tensor([sigma], dtype=torch.float64)
+    within = discrepancy_guard(reference + D, reference, noise, steps, allowance=0.0) - reference
+    share = share_by_definition(D, within, steps, sigma)
+    assert (share > 0) == partly or tilt > 0
+    torch.testing.assert_close(guard_by_modes(reference + D, reference, noise, steps), reference + share * within)
 
 
 def test_noise_is_followed_and_what_no_noise_explains_is_given_back():

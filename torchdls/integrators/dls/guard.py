@@ -4,8 +4,15 @@ What a method takes away from the least-squares height should be noise: of the r
 part of it. With D = z - z_ls, where the noise of the least-squares height is known exactly (full rectangles, equal
 weights, no anchors; C = dct2(D), S as in `torchdls.noise.height_noise`):
 
-    rho = sum |C|^2 / S / (sigma^2 (HW - 1))         above 1 it took more than there was: part of it was surface
-    q   = sum |C|^2 S^-1/4 / (sigma^2 sum S^3/4)     near 0 it found hardly any of the noise, as on texture
+    r_p(z) = sum |C|^2 S^-p / (sigma^2 sum S^(1-p))     the share of the noise that was removed; p = 0 counts the error
+                                                        of the height, p = 1 every mode alike
+
+With z' the height after bands of modes have given back what exceeds their noise, four figures tell:
+
+    r_1/4(z')                 near 0 it found hardly any of the noise, as on texture
+    r_3/4(z') / r_1/4(z')     large where fine modes went and slow ones stayed: detail rather than noise
+    r_1/4(z) / r_1/4(z')      large where bands had to give back much: what they keep was taken as blindly
+    r_1(z)                    above 1 it took more than there was
 
 Elsewhere the energy of the slopes on the edges is all that is known without the shape of the noise:
 
@@ -27,8 +34,8 @@ from torchdls.operators.edges import mean_trust
 from torchdls.selection import discrepancy_guard
 
 # On fifteen surfaces from 1 to 60 dB; checked on other draws (benchmarks/quality/gains.py).
-_MOST_REMOVED = (0.95, 1.2)  # rho at which the height is followed wholly, and not at all
-_LEAST_FOUND = (0.18, 0.28)  # q at which it is not followed, and wholly
+_FOUND = (0.18, 0.28)  # the first figure: from not followed to wholly
+_FINE, _GIVEN_BACK, _REMOVED = (1.85, 2.2), (1.3, 1.8), (1.0, 1.6)  # the others: from wholly followed to not at all
 _SLOPES = (0.45, 0.55, 0.7, 0.85)  # e: from not at all to wholly, and back
 
 
@@ -59,7 +66,7 @@ def guard(height: Tensor, reference: Tensor, fields: Fields, noise: Tensor) -> T
 
 
 def guard_by_modes(height: Tensor, reference: Tensor, noise: Tensor, pixel_size: tuple[float, float]) -> Tensor:
-    """On full rectangles with equal trust: bands of modes give back what exceeds the noise, then `rho` and `q` decide.
+    """On full rectangles with equal trust: bands of modes give back what exceeds the noise, then the figures decide.
 
     Args:
         height: (N, 1, H, W).
@@ -82,8 +89,10 @@ def guard_by_modes(height: Tensor, reference: Tensor, noise: Tensor, pixel_size:
         energy = (weight * dct2((z - reference).detach()).square()).sum((-3, -2, -1))
         return _over(energy, power * (weight * variance).sum())
 
-    least, most = _LEAST_FOUND, _MOST_REMOVED
-    share = _ramp(removed(within, 0.25), *least) * (1 - _ramp(removed(height, 1.0), *most))
+    found = removed(within, 0.25)
+    share = _ramp(found, *_FOUND) * (1 - _ramp(removed(height, 1.0), *_REMOVED))
+    share = share * (1 - _ramp(_over(removed(within, 0.75), found), *_FINE))
+    share = share * (1 - _ramp(_over(removed(height, 0.25), found), *_GIVEN_BACK))
     return reference + share[:, None, None, None] * (within - reference)
 
 
@@ -116,7 +125,7 @@ def guard_by_slopes(height: Tensor, reference: Tensor, noise: Tensor, fields: Fi
 
 def _over(energy: Tensor, expected: Tensor) -> Tensor:
     """Their ratio; infinite without noise, so that least squares remains."""
-    some = expected > 0
+    some = (expected > 0) & expected.isfinite()
     return torch.where(some, energy / torch.where(some, expected, 1), torch.inf)
 
 

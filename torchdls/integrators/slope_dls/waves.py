@@ -25,7 +25,7 @@ def shrink_slow_waves(
     x_k is the coefficient of mode k in the orthonormal basis of the fields that have a surface (L_k^(1/2) dct2(z_ls)_k,
     L_k the eigenvalue of the Laplacian), s_k its noise; R_T is Stein's unbiased estimate of the risk of threshold T,
     with s_k^2 in the denominator replaced by its mean. The thresholds 0, 1/2, .. 5/2 are averaged rather than chosen
-    among, since the risk of few modes scatters.
+    among, since the risk of few modes scatters. `SlopeDLS` ends with it; any other height of patches gains too.
 
     Args:
         height: (N, 1, H, W), on a full rectangle.
@@ -39,6 +39,14 @@ def shrink_slow_waves(
 
     Source: the shrinkage after Karacali, Snyder, IEEE TIP 13(2), 2004; the mean after Leung, Barron, IEEE Trans. IT
     52(8), 2006.
+
+    Example:
+        >>> surface = torchdls.SURFACES["tent"](64)
+        >>> noisy = torchdls.add_noise(surface.gradient, 5, torch.Generator().manual_seed(0))
+        >>> height, reference = torchdls.DLS(n_iter=10)(noisy), torchdls.LeastSquares()(noisy)
+        >>> smoother = torchdls.shrink_slow_waves(height, reference, torchdls.noise_level(noisy))
+        >>> [round(float(torchdls.rmse(z, surface.height)), 1) for z in (height, smoother)]
+        [0.7, 0.5]
     """
     shape = (height.shape[-2], height.shape[-1])
     slow = _slow(shape, period, height)
