@@ -117,11 +117,11 @@ def test_derivative_where_all_of_it_is_followed():
 @pytest.mark.parametrize("name", ["plane", "saddle", "sphere", "gaussians"])
 def test_without_noise_it_is_least_squares(name, dtype):
     if name == "plane":
-        gradient = torch.tensor([0.3, -0.7], dtype=dtype).view(1, 2, 1, 1).expand(1, 2, 40, 32)
+        gradient = torch.tensor([0.3, -0.7], dtype=dtype).view(1, 2, 1, 1).expand(1, 2, 24, 20)
     else:
-        gradient = SURFACES[name]((40, 32), dtype=dtype).gradient
+        gradient = SURFACES[name]((24, 20), dtype=dtype).gradient
     plain = LeastSquares()(gradient)
-    assert (DLS(n_iter=6)(gradient) - plain).abs().max() <= 1e-5 * plain.abs().max()
+    assert (DLS(n_iter=3)(gradient) - plain).abs().max() <= 1e-5 * plain.abs().max()
 
 
 def test_one_argument_away_is_the_bare_iteration():
