@@ -124,8 +124,8 @@ class DLS(Iterative[DLSResult]):
             took away looks like noise (`torchdls.integrators.dls.guard`). On full rectangles with equal weights that is
             told mode by mode: hardly ever worse than least squares, which remains where there is no noise. With masks,
             weights or anchors the energy of the slopes tells alone, which is less sure: from 20 dB on, on textured or
-            curved relief, up to 1.5 times the error of least squares. Gross errors, too, bring least squares back rather
-            than being mended. False: the height of the iterations, as in the paper. "auto": "guard" for mu="auto" and
+            curved relief, up to 1.5 times the error of least squares. Gross errors, too, bring least squares back and
+            are not mended. False: the height of the iterations, as in the paper. "auto": "guard" for mu="auto" and
             the data term `LeastSquares`, else False. True: predict for each surface the risk of several thresholds
             without the truth (`torchdls.select`), and take the best, or least squares (lam = 0) where none promises to
             cut its risk by a third. Seven runs instead of one; three where mu is a number. For full rectangles with
