@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.fft import dstn
 
-from torchdls.noise import _CUT, _TRIMMED_VARIANCE, add_noise, noise_level, noise_sigma
+from torchdls.noise import _CUT, _TRIMMED_VARIANCE, add_noise, averaging_error, noise_level, noise_sigma
 from torchdls.operators import GradientOperator, dct2, edge_slopes, idct2, neumann_eigenvalues
 from torchdls.surfaces import SURFACES, terrain
 
@@ -230,3 +230,65 @@ def test_bad_input():
         noise_level(g, mask)
     with pytest.raises(ValueError, match="pixel_size"):
         noise_level(g, pixel_size=-1)
+
+
+# What averaging errs by
+
+
+def averaging_error_by_loops(g, t, sigma):
+    """From the definition, along the rows of one component and then along the columns of the other."""
+    total = noise = weight = 0.0
+    for c in (0, 1):
+        for slopes, trust in zip(g[c] if c == 0 else g[c].T, t[c] if c == 0 else t[c].T, strict=True):
+            for i in range(len(slopes) - 3):
+                if (trust[i : i + 4] > 0).all():
+                    r = slopes[i] - 3 * slopes[i + 1] + 3 * slopes[i + 2] - slopes[i + 3]
+                    u = 1 / trust[i] + 9 / trust[i + 1] + 9 / trust[i + 2] + 1 / trust[i + 3]
+                    total, noise, weight = total + r * r / (u + 600), noise + u / (u + 600), weight + 1 / (u + 600)
+    return (total / sigma**2 - noise) / weight / 48
+
+
+@pytest.mark.parametrize("pixel_size", [(1.0, 1.0), (0.5, 2.0)])
+def test_averaging_error_follows_its_definition(pixel_size):
+    relief = torch.randn(12, generator=torch.Generator().manual_seed(2)).double()  # the same in every row: without curl
+    g = 0.3 * white(1, (9, 12))
+    g[:, 0] += relief
+    t = torch.rand(1, 2, 9, 12, generator=torch.Generator().manual_seed(1)).double()
+    t[0, 0, 4, 5] = 0
+    t = t / t[t > 0].mean()
+    sigma = noise_level(g, weight=t, pixel_size=pixel_size)
+    expected = averaging_error_by_loops(g[0], t[0], sigma)
+    assert 0 < float(expected) < 1e4
+    for scale in (1.0, 1e-20):
+        found = averaging_error(g, None, scale * t, pixel_size)
+        torch.testing.assert_close(found.flatten(), expected.view(1))
+    torch.testing.assert_close(averaging_error(5 * g, None, t, pixel_size), found)
+
+
+def test_averaging_error_finds_the_error_of_creases_under_noise():
+    """Folds at random places between the pixels, each by 1: the error of the mean is known edge by edge."""
+    generator = torch.Generator().manual_seed(4)
+    place = 4 * torch.arange(30) + 2 + torch.rand(30, generator=generator).double()  # one fold in four edges
+    x = torch.arange(124).double()
+
+    def f(x):  # zigzag: slope 0 and 1 in turn
+        sign = torch.tensor([1.0, -1.0]).double().repeat(15)
+        return (sign * (x[..., None] - place).clamp(min=0)).sum(-1)
+
+    slope = (f(x + 1e-6) - f(x - 1e-6)) / 2e-6
+    true = ((slope[1:] + slope[:-1]) / 2 - (f(x[1:]) - f(x[:-1]))).square().mean() / 2  # none along y
+    g = torch.stack([slope.expand(80, 124), torch.zeros(80, 124).double()])[None]
+    sd = 0.1 * (0.5 + torch.rand(1, 1, 80, 124, generator=generator).double())
+    noisy = g + sd * white(1, (80, 124))
+    weight = sd.square().reciprocal()
+    found = averaging_error(noisy, None, weight) / weight.mean()
+    assert 0.5 * true < float(found) < 2 * true
+    assert float(averaging_error(sd * white(1, (80, 124)), None, weight)) < 0.1
+
+
+def test_averaging_error_of_what_cannot_tell():
+    for shape in ((1, 9), (3, 3), (2, 3)):
+        assert (averaging_error(white(1, shape), None, torch.ones(1, 1, *shape).double()) == 0).all()
+    assert (averaging_error(white(1, (8, 8)), None, torch.zeros(1, 1, 8, 8).double()) == 0).all()
+    saddle = SURFACES["saddle"](20).gradient
+    assert averaging_error(saddle, None, torch.ones(1, 1, 20, 20)).isfinite().all()

@@ -69,6 +69,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "render": (torchdls.render, n, lights),
     "rmse": (torchdls.rmse, z, z.square()),
     "select": (lambda g: torchdls.select(lambda x: torchdls.HarkerOLeary()(x), g, 1).height, g),
+    "shrink_slow_waves": (lambda a, b: torchdls.shrink_slow_waves(a, b, 0.1 * torch.ones(1)), z, z.square()),
     "solve": (lambda g: torchdls.solve(g, g.abs()).height, g),
     "soup_dil_sweep": (lambda p, d: soup_dil_sweep(p, d, B, 0.1)[1], P, D),
     "sparse_normals": (lambda i, k: torchdls.sparse_normals(i, k, n_iter=5).normals, images, lights),

@@ -57,6 +57,7 @@ from .integrators import TotalVariation as TotalVariation
 from .integrators import Unroll as Unroll
 from .integrators import WeightedLeastSquares as WeightedLeastSquares
 from .integrators import dls_objective as dls_objective
+from .integrators import shrink_slow_waves as shrink_slow_waves
 from .io import load_camera as load_camera
 from .io import load_field as load_field
 from .io import load_height as load_height

@@ -13,7 +13,7 @@ from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls._tracing import holds_everywhere
 from torchdls.operators import as_pixel_size, dst2, edge_slopes
 from torchdls.operators.cosine import cosine_matrix
-from torchdls.operators.edges import cell_curl, cell_edges
+from torchdls.operators.edges import cell_curl, cell_edges, complete_cells, mean_trust
 from torchdls.operators.sine import squared_sines
 from torchdls.operators.tables import table
 
@@ -106,29 +106,35 @@ def noise_if_told(
     n, (dx, dy) = gradient.shape[0], pixel_size  # not len(), which a graph for every batch size cannot follow
     if min(gradient.shape[-2:]) < 2:
         return gradient.new_zeros(n), torch.zeros(n, dtype=torch.bool, device=gradient.device)
-    v, w = edge_slopes(gradient, mask, weight)
+    v, w = edge_slopes(gradient, mask)
     curl = cell_curl(v, (dx, dy))
     scale = math.hypot(dx, dy)
-    if w is None:
+    if w is None and weight is None:
         sigma = torch.minimum(_robust_scale(curl / scale), _spectral_scale(curl, dx, dy))
         return sigma, torch.ones(n, dtype=torch.bool, device=gradient.device)
-    unit, cells = _normalised(curl, w, dx, dy)
+    unit, cells = _normalised(curl, _trusts(gradient, mask, weight), dx, dy)
     local, spectral = _robust_scale(unit, cells), _spectral_scale(unit * scale, dx, dy)
     sigma = torch.where(_stationary(mask, weight), torch.minimum(local, spectral), local)
     return sigma, cells.flatten(1).any(1)
 
 
-def _normalised(curl: Tensor, w: Tensor, dx: float, dy: float) -> tuple[Tensor, Tensor]:
-    """The curl over its standard deviation for sigma = 1, and the cells whose four edges all count.
+def _trusts(gradient: Tensor, mask: Tensor | None, weight: Tensor | None) -> Tensor:
+    """(N, 2, H, W) trust in each sample, 0 outside the mask."""
+    trust = torch.ones_like(gradient) if weight is None else weight.expand_as(gradient)
+    return trust if mask is None else torch.where(mask, trust, 0)
 
-    An edge of weight w_e = (t_i + t_j)/2 averages samples of variance sigma^2/t: its slope has variance
-    sigma^2/(2 w_e).
+
+def _normalised(curl: Tensor, trust: Tensor, dx: float, dy: float) -> tuple[Tensor, Tensor]:
+    """The curl over its standard deviation for sigma = 1, and the cells all of whose samples are trusted.
+
+    The mean of two samples of variance sigma^2/t has variance sigma^2 (1/t_i + 1/t_j)/4.
     """
-    edges = cell_edges(w)
-    cells = (edges > 0).all(1)
-    halves = 0.5 / torch.where(cells[:, None], edges, 1)
-    variance = dx * dx * halves[:, :2].sum(1) + dy * dy * halves[:, 2:].sum(1)
-    return torch.where(cells, curl, 0) / variance.sqrt(), cells
+    good = trust > 0
+    v, there = (edge_slopes(x)[0] for x in (torch.where(good, 1 / torch.where(good, trust, 1), 0), good.to(trust)))
+    cells = complete_cells(there == 1)
+    spread = cell_edges(v)
+    variance = 0.5 * (dx * dx * spread[:, :2].sum(1) + dy * dy * spread[:, 2:].sum(1))
+    return torch.where(cells, curl, 0) / torch.where(cells, variance, 1).sqrt(), cells
 
 
 def _stationary(mask: Tensor | None, weight: Tensor | None) -> Tensor:
@@ -187,6 +193,69 @@ def _check(gradient: Tensor, mask: Tensor | None, weight: Tensor | None) -> None
         )
     if weight is not None and not holds_everywhere(weight.isfinite() & (weight >= 0)):
         raise ValueError("noise_level: weight holds negative, NaN or infinite values")
+
+
+_ORDINARY = 600.0  # 30 times u for trusts of 1
+_LARGEST_ERROR = 1e4  # of averaging, in units of the noise: beyond it all weights are alike anyway
+
+
+def averaging_error(
+    gradient: Tensor,
+    mask: Tensor | None,
+    weight: Tensor,
+    pixel_size: tuple[float, float] = (1.0, 1.0),
+) -> Tensor:
+    r"""How far the mean of two neighbouring slopes is from the slope between them, in units of the noise.
+
+    A crease somewhere between the pixels i and i + 1 turns the slope by c and puts their mean off by c (f - 1/2), where
+    f is uniform: by c^2/12 on average. c shows in the third difference of the slopes, and so does the error on a curved
+    surface (where it is smaller):
+
+        r = g_{i-1} - 3 g_i + 3 g_{i+1} - g_{i+2},     mean error^2 = mean (r^2 - sigma^2 u) / 48
+        u = 1/t_{i-1} + 9/t_i + 9/t_{i+1} + 1/t_{i+2}
+
+    The mean over the surface is weighted by 1 / (u + 600) for trusts of mean 1: all edges alike, also those where steep
+    relief is trusted less, but for the worst, whose noise would drown the rest. sigma is read from the curl, as by
+    `noise_level`.
+
+    Args:
+        gradient: (N, 2, H, W).
+        mask: (N, 1, H, W) bool, or None.
+        weight: (N, 1 or 2, H, W).
+        pixel_size: (dx, dy).
+
+    Returns:
+        (N, 1, 1, 1): the mean squared error over the noise variance of a sample of mean trust, from 0 to 1e4; 0 where
+        the field is too small or too sparse to tell. It does not depend on the scale of the slopes or the weights.
+    """
+    trust = _trusts(gradient, mask, weight)
+    gradient = gradient if mask is None else torch.where(mask, gradient, 0)
+    trust = trust / mean_trust(trust)
+    if min(gradient.shape[-2:]) < 2 or max(gradient.shape[-2:]) < 4:
+        return 0 * trust[:, :1, :1, :1]
+    dx, dy = pixel_size
+    unit, cells = _normalised(cell_curl(edge_slopes(gradient)[0], (dx, dy)), trust, dx, dy)
+    power = _robust_scale(unit, cells).nan_to_num(0.0).square()
+    sums = [_third_differences(gradient[:, c], trust[:, c], dim) for c, dim in ((0, -1), (1, -2))]
+    square, noise, total = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
+    noisy, known = power > 0, (total > 0) & cells.flatten(1).any(1)
+    over = (square / torch.where(noisy, power, 1) - noise) / torch.where(known, total, 1) / 48
+    over = torch.where(noisy, over, _LARGEST_ERROR * (square > 0)).clamp(0, _LARGEST_ERROR)
+    return torch.where(known, over, 0)[:, None, None, None]
+
+
+def _third_differences(g: Tensor, trust: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
+    """(N,) sums of q r^2, q u and q along one axis of (N, H, W), where all four samples are trusted."""
+    n = g.shape[dim] - 3
+    if n < 1:
+        return (0 * g[:, 0, 0],) * 3
+    ends = [(g.narrow(dim, k, n), trust.narrow(dim, k, n)) for k in range(4)]
+    live = torch.stack([t > 0 for _, t in ends]).all(0)
+    r, u = torch.zeros_like(ends[0][0]), torch.zeros_like(ends[0][0])
+    for factor, (slope, t) in zip((1, -3, 3, -1), ends, strict=True):
+        r, u = r + factor * slope, u + factor**2 / torch.where(live, t, 1)
+    q = torch.where(live, 1 / (u + _ORDINARY), 0)
+    return (q * r.square()).sum((-2, -1)), (q * u).sum((-2, -1)), q.sum((-2, -1))
 
 
 # --- what least squares makes of white noise --------------------------------------------------------------------------

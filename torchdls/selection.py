@@ -27,23 +27,29 @@ _FINE = 3.0  # modes whose Laplacian eigenvalue exceeds this (of 8) are left alo
 
 
 def discrepancy_guard(
-    height: Tensor, reference: Tensor, noise: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)
+    height: Tensor,
+    reference: Tensor,
+    noise: Tensor,
+    pixel_size: tuple[float, float] = (1.0, 1.0),
+    *,
+    allowance: float = 1.0,
 ) -> Tensor:
     r"""Give back to a smoothed height what was taken from it beyond the noise, band by band.
 
         z + (1 - a_b) (z_ls - z)   in band b,   a_b = min(1, N_b / R_b)
-        R_b = sum of |C_kl|^2 / S_kl over the band, C = dct2(z - z_ls);   N_b = sigma^2 (n_b + sqrt(2 n_b))
+        R_b = sum of |C_kl|^2 / S_kl over the band, C = dct2(z - z_ls);   N_b = sigma^2 (n_b + a sqrt(2 n_b))
 
     R_b is the energy that was removed, in units of the noise that least squares leaves in each of the n_b
-    coefficients; N_b is the most that the noise itself can account for, give or take one standard deviation. Where R_b
-    exceeds it the difference is part surface, and a_b = N_b / R_b is then the best factor, in the sense of mean
-    squares. Bands are rings of frequencies, divided into sectors of directions.
+    coefficients; N_b is the most that the noise itself can account for, with an `allowance` of a standard deviations.
+    Where R_b exceeds it the difference is part surface, and a_b = N_b / R_b is then the best factor, in the sense of
+    mean squares. Bands are rings of frequencies, divided into sectors of directions.
 
     Args:
         height: (N, 1, H, W) on a full rectangle.
         reference: (N, 1, H, W), the least-squares height of the same data, with equal trust in all slopes.
         noise: (N,) standard deviation of one gradient sample.
         pixel_size: (dx, dy).
+        allowance: a.
 
     Returns:
         (N, 1, H, W).
@@ -56,7 +62,7 @@ def discrepancy_guard(
     weight = torch.where(band.view(shape) > 0, 1 / torch.where(variance > 0, variance, 1), 0)
     removed = _band_sums((difference.square() * weight).flatten(1), band, n_bands)
     count = _band_sums(torch.ones_like(variance).view(1, -1), band, n_bands)[0]
-    allowed = noise[:, None].square() * (count + (2 * count).sqrt())
+    allowed = noise[:, None].square() * (count + allowance * (2 * count).sqrt())
     beyond = removed > allowed
     beyond[:, 0] = False
     share = torch.where(beyond, allowed / torch.where(beyond, removed, 1), 1)

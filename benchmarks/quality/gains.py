@@ -1,10 +1,10 @@
 """Gain over least squares on every surface: `python -m benchmarks.quality.gains` (add --smoke for a smoke run).
 
 All analytic surfaces and real terrain, several noise levels and draws. SlopeDLS runs as it comes. DLS runs as it comes,
-at the best of a sweep of thresholds, chosen per row with the truth in hand, and with `select=True`, which chooses
-without it. The comparators run at the best of a sweep. A row is a surface at a noise level: the mean error of least
-squares over the mean error of the method. Writes JSON with every row and a Markdown table of geometric means and worst
-rows, and a picture.
+bare (`select=False`), at the best of a sweep of thresholds, chosen per row with the truth in hand, and with
+`select=True`, which chooses without it. The comparators run at the best of a sweep. A row is a surface at a noise
+level: the mean error of least squares over the mean error of the method. Writes JSON with every row and a Markdown
+table of geometric means and worst rows, and a picture.
 """
 
 from __future__ import annotations
@@ -89,6 +89,7 @@ def methods(full: bool, n: int) -> dict[str, list[Method]]:
         chosen["SlopeDLS, plain, guard='sure'"] = [SlopeDLS(recipe="plain", guard="sure")]
         chosen["second-order TV, best of 4"] = [lambda g, w=w: second_order_tv(g, w) for w in WEIGHTS]
         chosen["DLS"] = [DLS(n_iter=15, tol=0)]
+        chosen["DLS, bare"] = [DLS(n_iter=15, tol=0, select=False)]
         chosen["DLS, best of 3"] = [dls(mu) for mu in THRESHOLDS]
         chosen["DLS, select"] = [DLS(n_iter=15, tol=0, select=True)]
         chosen["SR, best of 6"] = [SpectralRegularization(m) for m in MODES if m <= n]

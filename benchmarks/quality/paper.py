@@ -25,7 +25,7 @@ from torch import Tensor
 from benchmarks.common.paper_figures import comparison, photometric_figure, sweep_plot
 from benchmarks.common.report import markdown_table, results_folder, write_json
 from benchmarks.quality.dls import PAPER, SNRS, Case
-from torchdls import DLS, INTEGRATORS, noise_level
+from torchdls import DLS, INTEGRATORS, LeastSquares, noise_level, shrink_slow_waves
 
 # The columns of the paper, by the names of the registry; the paper's figures for SNRS.
 COLUMNS = {"dls": "DLS", "spectral_regularization": "SR", "total_variation": "TV", "least_squares": "DCTLS"}
@@ -106,12 +106,18 @@ def statistics(found: Found, level: int) -> dict[str, dict[str, float]]:
     return {k: {"mean": float(v[level].mean()), "spread": float(v[level].std(correction=0))} for k, v in found.items()}
 
 
+def with_slow_waves(gradient: Tensor) -> Tensor:
+    """DLS as it comes, then the waves that its patches cannot see."""
+    return shrink_slow_waves(DLS()(gradient), LeastSquares()(gradient), noise_level(gradient))
+
+
 def all_rows(case: Case) -> list[dict[str, Any]]:
     """Every integrator of the registry with its defaults, and DLS around the robust data terms."""
     methods: dict[str, Any] = {name: INTEGRATORS[name] for name in INTEGRATORS if name not in SLOW}
     for term in ("total_variation", "l1"):
         if term in INTEGRATORS:
             methods[f"dls({term})"] = lambda term=term: DLS(data_term=INTEGRATORS[term]())
+    methods |= {"dls(select=False)": lambda: DLS(select=False), "dls, slow waves shrunk": lambda: with_slow_waves}
     rows = []
     for name, factory in methods.items():
         began = time.perf_counter()

@@ -137,7 +137,7 @@ METHODS: dict[str, Method] = {
             "block": {**DLS_EXACT, "learner": SoupDIL("block", n_sweeps=2, bound=3.0)},
             "shared": {**DLS_EXACT, "learn": "shared", "pixel_size": (0.5, 1.5)},
             "proximal": {**DLS_EXACT, "height_step": Proximal(2)},
-            "soft": {**DLS_EXACT, "learner": SoupDIL(threshold="soft"), "mu": "auto"},
+            "soft": {**DLS_EXACT, "learner": SoupDIL(threshold="soft"), "mu": "auto", "select": False},
             "firm": {**DLS_EXACT, "learner": SoupDIL("block", threshold="firm")},
             "fixed": {**DLS_EXACT, "learn": "fixed", "derivative": "unroll"},
         },

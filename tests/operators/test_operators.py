@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from scipy.optimize import minimize_scalar
 
 from tests.helpers import assert_adjoint, assert_gradients, assert_unchanged, random_field
 from tests.helpers.oracles import differences, edge_vector
 from torchdls import GradientOperator, edge_slopes
-from torchdls.operators import as_pixel_size, slope_divergence
+from torchdls.operators import as_pixel_size, present_edges, slope_divergence
 
 SOBEL = (((-1, 0, 1), (-2, 0, 2), (-1, 0, 1)), ((-1, -2, -1), (0, 0, 0), (1, 2, 1)))
 DIAGONAL = (((-1, 0, 0), (0, 0, 0), (0, 0, 1)), ((0, 0, 1), (0, 0, 0), (-1, 0, 0)))
@@ -133,6 +134,24 @@ def test_pixel_size_takes_any_real_number():
     assert as_pixel_size([np.float64(1), 3]) == (1.0, 3.0)
 
 
+K = 1e5  # squared difference of the slopes at both ends of an edge, in variances of the better one
+
+
+def best_slope(g_i, g_j, t_i, t_j):
+    """The estimate (1/2 + d) g_i + (1/2 - d) g_j of least expected squared error, and the inverse of that, by SciPy.
+
+    The samples have variances 1/t, and their slopes differ by D either way: the estimate errs by d D at the middle.
+    """
+    if min(t_i, t_j) == 0:
+        return (g_j, 2 * t_j / (4 + K)) if t_i == 0 else (g_i, 2 * t_i / (4 + K))
+
+    def error(d):
+        return (0.5 + d) ** 2 / t_i + (0.5 - d) ** 2 / t_j + d**2 * K / max(t_i, t_j)
+
+    found = minimize_scalar(error, bounds=(-0.5, 0.5), method="bounded", options={"xatol": 1e-12})
+    return (0.5 + found.x) * g_i + (0.5 - found.x) * g_j, 0.5 / found.fun
+
+
 def slopes_by_loops(g, mask, t):
     """v and w of one field, edge by edge from the definition."""
     _, h, w = g.shape
@@ -141,8 +160,7 @@ def slopes_by_loops(g, mask, t):
         for y, x in itertools.product(range(h - down), range(w - right)):
             i, j = (c, y, x), (c, y + down, x + right)
             if mask[y, x] and mask[y + down, x + right] and t[i] + t[j] > 0:
-                v[i] = (t[i] * g[i] + t[j] * g[j]) / (t[i] + t[j])
-                trust[i] = (t[i] + t[j]) / 2
+                v[i], trust[i] = best_slope(g[i], g[j], t[i], t[j])
     return v, trust
 
 
@@ -160,10 +178,42 @@ def test_edge_slopes_follow_their_definition(masked, channels):
     inside = torch.ones(2, 1, 6, 5, dtype=torch.bool) if mask is None else mask
     for n in range(2):
         expected = slopes_by_loops(g[n].nan_to_num().numpy(), inside[n, 0].numpy(), trust[n].numpy())
-        np.testing.assert_allclose(v[n].numpy(), expected[0], atol=1e-14)
+        np.testing.assert_allclose(v[n].numpy(), expected[0], atol=1e-8)
         if w is not None:
-            np.testing.assert_allclose(w[n].numpy(), expected[1], atol=1e-14)
+            np.testing.assert_allclose(w[n].numpy(), expected[1], rtol=1e-8)
     assert (w is None) == (mask is None and weight is None)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scale", [1e-24, 1.0, 1e24])
+def test_trusts_have_no_scale_and_equal_ones_take_the_mean(dtype, scale):
+    g, error = random_field(1, 2, 6, 5, dtype=dtype), torch.full((1, 1, 1, 1), 0.7, dtype=dtype)
+    v, w = edge_slopes(g, weight=torch.full_like(g, scale), error=error)
+    there = present_edges(v)
+    torch.testing.assert_close(v, edge_slopes(g)[0])
+    torch.testing.assert_close(w / scale, there)
+    weight = torch.rand(1, 1, 6, 5, generator=torch.Generator().manual_seed(3)).to(dtype) ** 8
+    (v, w), (v_scaled, w_scaled) = (edge_slopes(g, weight=c * weight, error=error) for c in (1, scale))
+    torch.testing.assert_close(v_scaled, v)
+    torch.testing.assert_close(w_scaled / scale, w)
+
+
+def test_what_averaging_errs_by_adds_to_the_variance():
+    """One edge, of trusts 1 and 3, their mean 2: variance 1/3 and an error of .6 times 1/2; weights of 2 stay 2."""
+    weight = torch.tensor([[[[1.0, 3.0]]]]).double()
+    w = edge_slopes(torch.zeros(1, 2, 1, 2).double(), weight=weight, error=torch.full((1, 1, 1, 1), 0.6).double())[1]
+    expected = 0.5 / (1 / 3 + 0.3) * (1 / 4 + 0.3) / (1 / 4)
+    assert float(w[0, 0, 0, 0]) == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_slope_that_is_not_known_is_taken_from_the_other_end_and_continuously_so():
+    g = torch.tensor([[1.0, 5.0]]).double().expand(1, 2, 1, 2)
+    zero, tiny = (edge_slopes(g, weight=torch.tensor([[[[2.0, t]]]]).double()) for t in (0.0, 1e-14))
+    assert float(zero[0][0, 0, 0, 0]) == 1
+    assert 0 < float(zero[1][0, 0, 0, 0]) < 1e-4
+    torch.testing.assert_close(tiny, zero, rtol=1e-8, atol=1e-8)
+    neither = edge_slopes(g, weight=torch.zeros(1, 1, 1, 2).double())
+    assert all((x == 0).all() for x in neither)
 
 
 def test_edge_slopes_are_differentiable_and_ignore_nan_outside():

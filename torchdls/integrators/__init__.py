@@ -24,7 +24,7 @@ from torchdls.integrators.robust import (
     TotalVariation,
     WeightedLeastSquares,
 )
-from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
+from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult, shrink_slow_waves
 
 __all__ = [
     "AnisotropicDiffusion",
@@ -58,4 +58,5 @@ __all__ = [
     "TikhonovRegularization",
     "Unroll",
     "dls_objective",
+    "shrink_slow_waves",
 ]

@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 from torch import Tensor
 
 from torchdls.integrators.fields import Fields
+from torchdls.noise import averaging_error
 from torchdls.operators import GradientOperator, edge_slopes
 
 
@@ -30,6 +31,14 @@ class DataTerm(Protocol):
         """
 
 
+def edges_of(fields: Fields) -> tuple[Tensor, Tensor | None]:
+    """Slopes v and trusts w on the edges of the grid; weights count beside what averaging itself errs by."""
+    if fields.weight is None:
+        return edge_slopes(fields.gradient, fields.mask)
+    error = averaging_error(fields.gradient, fields.mask, fields.weight, fields.steps)
+    return edge_slopes(fields.gradient, fields.mask, fields.weight, error=error)
+
+
 class Quadratic(NamedTuple):
     """1/2 sum w (A z - v)^2: the data term of least squares, and of all whose trusts do not depend on the height."""
 
@@ -40,7 +49,7 @@ class Quadratic(NamedTuple):
     @classmethod
     def of(cls, fields: Fields) -> Quadratic:
         """That of least squares: slopes and trusts of the edges."""
-        return cls(*edge_slopes(fields.gradient, fields.mask, fields.weight), fields.steps)
+        return cls(*edges_of(fields), fields.steps)
 
     @property
     def steady(self) -> bool:

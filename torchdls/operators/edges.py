@@ -13,24 +13,47 @@ from torchdls._checks import check_field, check_fit
 from torchdls._precision import full_precision
 from torchdls._tracing import is_recorded
 
+# How many times the variance of the better end the squared difference of slopes between two pixels is taken for: far
+# above it, so that the slope leaves the middle of an edge only where one end is next to unknown.
+_BEND = 1e5
+
 
 @full_precision
 def edge_slopes(
-    gradient: Tensor, mask: Tensor | None = None, weight: Tensor | None = None
+    gradient: Tensor, mask: Tensor | None = None, weight: Tensor | None = None, *, error: Tensor | None = None
 ) -> tuple[Tensor, Tensor | None]:
-    """From a slope at each pixel to a slope, and a trust, on each edge between neighbours.
+    r"""From a slope at each pixel to a slope, and a trust, on each edge between neighbours.
 
-    The pixels i and j at the ends of an edge both measure its slope, with trusts t_i and t_j:
+    The pixels i and j at the ends of an edge both measure its slope, with trusts t_i and t_j (inverse variances):
 
-        v_e = (t_i g_i + t_j g_j) / (t_i + t_j)        w_e = (t_i + t_j) / 2
+        v_e = (g_i + g_j) / 2        w_e = 2 t_i t_j / (t_i + t_j)
 
-    and both must lie inside the mask, else v_e = w_e = 0. With equal trusts v_e is the average of Simchony, Chellappa
-    and Shao (1990), taken half way between the two pixels. What the gradient holds outside the mask is never read.
+    the average of Simchony, Chellappa and Shao (1990), which is the slope half way between the two pixels, and its
+    inverse variance; equal trusts t give w_e = t. Leaning towards the better end would lower the noise, but the slope
+    would no longer be that of the middle, and errors of one sign add up over many edges. Only where one end is all but
+    unknown does its slope give way, so that a pixel without a slope hangs on its neighbours by weak edges: with lo and
+    hi the smaller and the larger trust and the slopes taken to differ by k = 1e5 variances of the better end,
+
+        v_e = (g_i + g_j) / 2 + (t_i - t_j) / (t_i + t_j + k lo) (g_i - g_j) / 2
+        w_e = 2 hi (t_i + t_j + k lo) / (4 hi + k (t_i + t_j))
+
+    minimise the expected squared error of the slope at the middle; w_e is the inverse of that minimum. From equal
+    trusts down to t_i = 0 (v_e = g_j, w_e = 2 t_j / (4 + k)) the rule is smooth.
+
+    The mean of two slopes also errs where the surface is creased or curved, whatever the noise. With `error` this
+    counts as so much more variance, and where it dominates all weights become alike (t the mean trust):
+
+        w_e <- (1 + 2 error) w_e / (1 + 2 error w_e / t),        k <- k (1 + 2 error hi / t)
+
+    Both pixels must lie inside the mask, else v_e = w_e = 0; also w_e = 0 where both trusts are 0. What the gradient
+    holds outside the mask is never read.
 
     Args:
         gradient: (N, 2, H, W).
         mask: (N, 1, H, W) bool, or None for a full rectangle.
         weight: (N, 1, H, W) or (N, 2, H, W), at least 0, or None for equal trust.
+        error: (N, 1, 1, 1), mean squared error of the average over the noise variance of a sample of mean trust, as
+            `torchdls.noise.averaging_error` reads it off the gradient; None for 0. Without weights it has no effect.
 
     Returns:
         v: (N, 2, H, W); v[:, 0, :, j] belongs to the edge between columns j and j + 1 (0 in the last column),
@@ -47,24 +70,46 @@ def edge_slopes(
         tensor([[0.5000, 1.5000, 0.0000]])
         >>> trust is None  # all are trusted alike
         True
+        >>> weight = torch.tensor([[[[1.0, 3.0, 0.0]]]])
+        >>> slopes, trust = torchdls.edge_slopes(torch.arange(3.0).expand(1, 2, 1, 3), weight=weight)
+        >>> slopes[0, 0].round(decimals=3), trust[0, 0].round(decimals=3)  # the last pixel hangs on the other's slope
+        (tensor([[0.5000, 1.0000, 0.0000]]), tensor([[1.5000, 0.0000, 0.0000]]))
     """
     check_field("edge_slopes", "gradient", gradient, 2)
-    if mask is None and weight is None:
-        return _pair_sums(gradient) * 0.5, None
     if mask is not None:
         check_fit("edge_slopes", "mask", mask, gradient, "gradient", channels=(1,), dtype=torch.bool)
     if weight is not None:
         check_fit("edge_slopes", "weight", weight, gradient, "gradient", channels=(1, 2))
-    trust = torch.ones_like(gradient) if weight is None else weight.expand_as(gradient)
     if mask is not None:
-        gradient, trust = torch.where(mask, gradient, 0), torch.where(mask, trust, 0)
-    moment = trust * gradient
-    both = _pair_sums(trust)
-    if mask is not None:
-        both = torch.where(_pair_both(mask.expand_as(gradient)), both, 0)
-    some = both > 0
-    v = torch.where(some, _pair_sums(moment) / torch.where(some, both, 1), 0)
-    return v, both * 0.5
+        gradient = torch.where(mask, gradient, 0)
+    if weight is None:
+        v = _pair_sums(gradient) * 0.5
+        if mask is None:
+            return v, None
+        there = _pair_both(mask.expand_as(gradient))
+        return torch.where(there, v, 0), there.to(v.dtype)
+    trust = weight.expand_as(gradient) if mask is None else torch.where(mask, weight, 0).expand_as(gradient)
+    (g_i, g_j), (t_i, t_j) = _pair(gradient), _pair(trust)
+    hi, lo = torch.maximum(t_i, t_j), torch.minimum(t_i, t_j)
+    live = hi > 0 if mask is None else (hi > 0) & _pair_both(mask.expand_as(gradient))
+    unit = torch.where(live, hi, 1)
+    ratio, extra = lo / unit, 0 * lo if error is None else 2 * error * (unit / mean_trust(trust))
+    bend = _BEND * (1 + extra)
+    whole = 1 + ratio + bend * ratio
+    lean = 0.5 * (t_i - t_j) / unit / whole
+    v = (0.5 + lean) * g_i + (0.5 - lean) * g_j
+    w = 2 * whole / (4 + bend * (1 + ratio))
+    if error is not None:
+        w = w * (1 + 2 * error) / (1 + extra * w)
+    return torch.where(live, v, 0), torch.where(live, hi * w, 0)
+
+
+def mean_trust(trust: Tensor) -> Tensor:
+    """(N, 1, 1, 1) mean of the trusts (N, C, H, W) that are positive; 1 where none is."""
+    largest = trust.amax((-3, -2, -1), keepdim=True)
+    unit = torch.where(largest > 0, largest, 1)  # so that no sum overflows
+    count = (trust > 0).sum((-3, -2, -1), keepdim=True).clamp(min=1)
+    return torch.where(largest > 0, (trust / unit).sum((-3, -2, -1), keepdim=True) / count * unit, 1)
 
 
 @full_precision
@@ -171,6 +216,12 @@ def _central(g: Tensor, dim: int) -> Tensor:
 def _stack_edges(x: Tensor, y: Tensor) -> Tensor:
     """Edges along the rows (.., H, W - 1) and along the columns (.., H - 1, W), padded to one (.., 2, H, W) field."""
     return torch.cat([F.pad(x, (0, 1)), F.pad(y, (0, 0, 0, 1))], -3)
+
+
+def _pair(t: Tensor) -> tuple[Tensor, Tensor]:
+    """The values of a pixel field (.., 2, H, W) at both ends of each edge; 0 where there is no edge."""
+    tx, ty = t.split(1, -3)
+    return _stack_edges(tx[..., :-1], ty[..., :-1, :]), _stack_edges(tx[..., 1:], ty[..., 1:, :])
 
 
 def _pair_sums(t: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from torchdls._tracing import holds_everywhere
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # the entries of a symmetric 3 x 3 matrix that are kept
 _RANK = 1e-6  # a pivot below this part of its diagonal means that the lights do not span the space
+_ORDINARY = 2.5  # residuals up to so many deviations say nothing about their pixel
 _FACING = 1e-2  # smallest cosine to the viewer of a normal that has slopes, as in `normals_to_gradient`
 
 
@@ -28,9 +29,10 @@ class PhotometricResult(NamedTuple):
             (outside the mask, or without three lights that span the space): `normals_to_gradient` calls them invalid.
         albedo: (N, 1, H, W), for lights of length 1 the brightness under a light along the normal; 0 where unknown.
         confidence: (N, 1, H, W), at least 0, for use as the `weight` of an integrator: 1 / variance of the slopes, in
-            units that make its mean 1 over the pixels where it is positive. The variance of sample k is s^2 + r_k^2
-            with r_k its residual from the Lambertian model and s their robust scale on the whole surface; so pixels
-            that are dark, steep, lit by few lights or not Lambertian weigh less. 0 where there are no slopes.
+            units that make its mean 1 over the pixels where it is positive. The variance of sample k is
+            s^2 + max(0, r_k^2 - 6.25 s^2) with r_k its residual from the Lambertian model and s their robust scale on
+            the whole surface: ordinary noise leaves it as it is, and pixels that are dark, steep, lit by few lights or
+            not Lambertian weigh less. 0 where there are no slopes.
 
     Example:
         >>> normals = torchdls.gradient_to_normals(torchdls.SURFACES["peaks"](16).gradient)
@@ -157,7 +159,8 @@ def _confidence(b: Tensor, albedo: Tensor, samples: Samples) -> Tensor:
     residual = samples.images - shading(b, samples.lights)
     known = albedo > 0 if samples.lit is None else (albedo > 0) & samples.lit
     scale = _scale(residual, samples.images, known.expand_as(residual))
-    weight = torch.where(known, 1 / (scale.square() + residual.square()), 0)
+    beyond = (residual.square() - (_ORDINARY * scale).square()).clamp(min=0)
+    weight = torch.where(known, 1 / (scale.square() + beyond), 0)
     inverse, some = covariance(samples.lights, weight)
     c00, _, c02, c11, c12, c22 = inverse.split(1, 1)
     some = some & (b[:, 2:] > _FACING * albedo)

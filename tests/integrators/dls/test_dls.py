@@ -25,6 +25,7 @@ from torchdls import (
     noise_level,
     rmse,
 )
+from torchdls.noise import averaging_error
 from torchdls.surfaces import tent
 
 SMALL: dict[str, Any] = {"patch_size": 4, "stride": 2, "n_atoms": 16, "n_iter": 6, "tol": 0.0}
@@ -141,7 +142,8 @@ def test_objective_is_the_cost_of_what_is_returned():
     anchors = 0.25 * (result.height.square() * given["mask"]).sum((-3, -2, -1))
     torch.testing.assert_close(result.objective[:, -1], expected + anchors)
     # The same by loops, on the first surface.
-    v, w = edge_slopes(g, given["mask"], given["weight"])
+    error = averaging_error(g, given["mask"], given["weight"])
+    v, w = edge_slopes(g, given["mask"], given["weight"], error=error)
     z, inside = result.height[0, 0], given["mask"][0, 0]
     slopes = torch.zeros(2, H, W, dtype=z.dtype)
     slopes[0, :, :-1], slopes[1, :-1] = z.diff(dim=1), z.diff(dim=0)

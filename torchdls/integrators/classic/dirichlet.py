@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchdls._tracing import is_concrete
 from torchdls.integrators.base import Fields
+from torchdls.integrators.data_term import edges_of
 from torchdls.operators import GradientOperator, dirichlet_eigenvalues, dst2, edge_slopes
 from torchdls.solvers import SolveResult, solve
 
@@ -56,7 +57,7 @@ def _iterative(
 ) -> SolveResult:
     """An edge from a pixel to the border is an anchor of the pixel: its weight is that of the edge."""
     a = GradientOperator("forward", fields.steps)
-    v, w = edge_slopes(fields.gradient, mask, fields.weight)
+    v, w = edges_of(fields._replace(mask=mask))
     assert w is not None
     touching = a(known.to(w.dtype)) != 0  # edges with one end on the border; those with both ends there do not matter
     inner, outer = torch.where(touching | known, 0, w), torch.where(touching, w, 0)

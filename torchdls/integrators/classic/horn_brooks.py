@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchdls._tracing import is_concrete, seen_everywhere
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
-from torchdls.operators import GradientOperator, edge_slopes
+from torchdls.integrators.data_term import edges_of
+from torchdls.operators import GradientOperator
 from torchdls.operators.edges import edge_ends
 from torchdls.solvers import ConvergenceWarning
 from torchdls.solvers.components import free_constants
@@ -71,7 +72,7 @@ class HornBrooks(Integrator):
         a = GradientOperator("forward", fields.steps)
         g = fields.gradient
         mask = torch.ones_like(g[:, :1], dtype=torch.bool) if fields.mask is None else fields.mask
-        v, w = edge_slopes(g, mask, fields.weight)
+        v, w = edges_of(fields._replace(mask=mask))
         assert w is not None
         r = w.new_zeros(w.shape[0], 1, 1, 1) if fields.anchor_weight is None else fields.anchor_weight
         gauge = free_constants(w.detach(), r.detach().expand(len(w), 1, *w.shape[2:]))

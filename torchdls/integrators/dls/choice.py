@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -14,9 +15,19 @@ from torchdls.integrators.dls.problem import Problem
 from torchdls.integrators.fields import has_even_trust
 from torchdls.selection import select
 
+Select = bool | Literal["auto", "guard"]
+
 # Over 15 surfaces from 1 to 40 dB this norm and cut gained the most in RMSE and in SSIM, and did the least harm.
 _NORM, _LEAST_CUT = 0.0, 0.35
 _FACTORS = (1.0, 1.5, 2.25)  # of the noise of one sample: the thresholds that mu="auto" is chosen from
+
+
+def check_select(select: object, data_term: Integrator) -> None:
+    """ValueError for an unknown word, and for a guard by least squares of something else."""
+    if not (isinstance(select, bool) or select in ("auto", "guard")):
+        raise ValueError(f"DLS: select={select!r} given; choose from 'auto', 'guard', False, True")
+    if select == "guard" and type(data_term) is not LeastSquares:
+        raise ValueError(f"DLS: select='guard' holds to least squares, not to {type(data_term).__name__}")
 
 
 def check_selectable(data_term: Integrator, learn: str, mu: object) -> None:

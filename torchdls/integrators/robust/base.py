@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from torchdls.integrators.base import Fields
-from torchdls.integrators.data_term import DataTerm, anchored_cost
+from torchdls.integrators.data_term import DataTerm, anchored_cost, edges_of
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.settling import run_until_settled
-from torchdls.operators import edge_slopes
 from torchdls.solvers import solve
 
 Estimate = tuple[Tensor, ...]  # the height first, then whatever else an iteration hands to the next; all (N, ...)
@@ -110,7 +109,7 @@ class Robust(Iterative[RobustResult]):
 
     def _begin(self, fields: Fields, data: DataTerm) -> Estimate:
         """Where to start: the least-squares surface."""
-        v, w = edge_slopes(fields.gradient, fields.mask, fields.weight)
+        v, w = edges_of(fields)
         return (self._surface(fields, v, w, fields.anchor_weight),)
 
     def _advance(self, fields: Fields, data: DataTerm, state: Estimate) -> Estimate:

@@ -8,6 +8,7 @@ from torch.nn import functional
 
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls.integrators.base import Fields
+from torchdls.integrators.data_term import edges_of
 from torchdls.operators import GradientOperator, edge_slopes
 from torchdls.operators.edges import edges_at_pixels, present_edges
 from torchdls.solvers import solve
@@ -45,7 +46,7 @@ def replace_outliers(fields: Fields, *, tol: float = 1e-5) -> tuple[Tensor, Tens
     nearest, spread = _surroundings(given.detach(), inside)
     present, wrong, z = given, torch.zeros_like(inside), None
     for limit in _LIMITS:
-        v, w = edge_slopes(present, fields.mask, fields.weight)
+        v, w = edges_of(fields._replace(gradient=present))
         guess = None if z is None else z.detach()
         z = solve(v, w, fields.anchor, fields.anchor_weight, tol=tol, z0=guess, pixel_size=fields.steps).height
         expected = _at_pixels(a(z), fields.mask)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_alike, check_field, check_fit
+from torchdls._precision import full_precision
 from torchdls.noise import height_noise
 from torchdls.operators import dct2, idct2
 from torchdls.operators.cosine import neumann_eigenvalues
@@ -14,6 +16,7 @@ _TEMPERATURE = 8.0  # of the mean over the thresholds, in units of the noise of 
 _LEAST_CUT = 0.2  # share of the risk of least squares that must go, as predicted, for anything to be changed
 
 
+@full_precision
 def shrink_slow_waves(
     height: Tensor, reference: Tensor, noise: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0), period: float = 32.0
 ) -> Tensor:
@@ -25,7 +28,7 @@ def shrink_slow_waves(
     x_k is the coefficient of mode k in the orthonormal basis of the fields that have a surface (L_k^(1/2) dct2(z_ls)_k,
     L_k the eigenvalue of the Laplacian), s_k its noise; R_T is Stein's unbiased estimate of the risk of threshold T,
     with s_k^2 in the denominator replaced by its mean. The thresholds 0, 1/2, .. 5/2 are averaged rather than chosen
-    among, since the risk of few modes scatters.
+    among, since the risk of few modes scatters. `SlopeDLS` ends with it; any other height of patches gains too.
 
     Args:
         height: (N, 1, H, W), on a full rectangle.
@@ -37,9 +40,27 @@ def shrink_slow_waves(
     Returns:
         (N, 1, H, W); differentiable, with the p_T held fixed.
 
+    Raises:
+        TypeError: a tensor is not float32 or float64, or they differ in it.
+        ValueError: a shape does not fit.
+
     Source: the shrinkage after Karacali, Snyder, IEEE TIP 13(2), 2004; the mean after Leung, Barron, IEEE Trans. IT
     52(8), 2006.
+
+    Example:
+        >>> surface = torchdls.SURFACES["tent"](64)
+        >>> noisy = torchdls.add_noise(surface.gradient, 5, torch.Generator().manual_seed(0))
+        >>> height, reference = torchdls.DLS(n_iter=10)(noisy), torchdls.LeastSquares()(noisy)
+        >>> smoother = torchdls.shrink_slow_waves(height, reference, torchdls.noise_level(noisy))
+        >>> [round(float(torchdls.rmse(z, surface.height)), 1) for z in (height, smoother)]
+        [0.7, 0.5]
     """
+    check_field("shrink_slow_waves", "height", height, 1)
+    check_fit("shrink_slow_waves", "reference", reference, height, "height", channels=(1,))
+    check_alike("shrink_slow_waves", "noise", noise, height.dtype)
+    if height.ndim != 4 or noise.shape != height.shape[:1]:
+        shapes = f"height {tuple(height.shape)} and noise {tuple(noise.shape)}"
+        raise ValueError(f"shrink_slow_waves: {shapes} given, (N, 1, H, W) and (N,) are needed")
     shape = (height.shape[-2], height.shape[-1])
     slow = _slow(shape, period, height)
     eigenvalue = neumann_eigenvalues(shape, height, pixel_size)

@@ -1,0 +1,155 @@
+"""The guard of DLS against its definition, and DLS as it comes against the truth and least squares."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.fft import dctn, idctn
+
+from tests.helpers import MASKS, assert_gradients, random_field
+from tests.helpers.methods import bumps
+from torchdls import DLS, SURFACES, Huber, LeastSquares, add_noise, noise_level
+from torchdls.integrators.dls.guard import guard, guard_by_modes, guard_by_slopes
+from torchdls.integrators.fields import Fields
+from torchdls.metrics import rmse, ssim
+from torchdls.selection import discrepancy_guard
+
+H, W = 24, 20
+
+
+def fields(gradient, mask=None, weight=None, steps=(1.0, 1.0)):
+    return Fields(gradient, mask, weight, None, None, steps)
+
+
+def spectrum(steps):
+    """S and L of every mode, from the formulas of `height_noise` and the Laplacian."""
+    y, x = np.sin(np.pi * np.arange(H) / 2 / H)[:, None] ** 2, np.sin(np.pi * np.arange(W) / 2 / W)[None] ** 2
+    ay, ax = 4 * y / steps[1] ** 2, 4 * x / steps[0] ** 2
+    total = ax + ay
+    return np.divide(ax * (1 - x) + ay * (1 - y), total**2, out=np.zeros((H, W)), where=total > 0), total
+
+
+def noise_height(seed, steps=(1.0, 1.0), sigma=1.0):
+    """A least-squares height of pure noise: independent modes of variance S."""
+    S, _ = spectrum(steps)
+    modes = np.random.default_rng(seed).standard_normal((H, W)) * np.sqrt(S) * sigma
+    return torch.from_numpy(idctn(modes, norm="ortho"))[None, None]
+
+
+def ramp(x, low, high):
+    return min(max((x - low) / (high - low), 0), 1)
+
+
+def share_by_definition(D, within, steps, sigma):
+    """From the four figures of the docstring, mode by mode in NumPy."""
+    S, _ = spectrum(steps)
+    some = S > 0
+
+    def removed(d, p):
+        C = dctn(d[0, 0].numpy(), norm="ortho")
+        return (C[some] ** 2 * S[some] ** -p).sum() / sigma**2 / (S[some] ** (1 - p)).sum()
+
+    found = removed(within, 0.25)
+    share = ramp(found, 0.18, 0.28) * (1 - ramp(removed(within, 0.75) / found, 1.85, 2.2))
+    return share * (1 - ramp(removed(D, 0.25) / found, 1.3, 1.8)) * (1 - ramp(removed(D, 1.0), 1.0, 1.6))
+
+
+@pytest.mark.parametrize("steps", [(1.0, 1.0), (0.5, 2.0)])
+@pytest.mark.parametrize("taken, tilt, partly", [(0.1, 0, False), (0.25, 0, True), (0.5, 0, True), (1.2, 0, True),
+                                                (1.5, 0, False), (1.9, 0, False), (0.4, 0.8, True)])  # fmt: skip
+def test_shares_follow_their_definition(taken, tilt, partly, steps):
+    """The same part of the noise is taken from every mode, or more from fine ones."""
+    (S, L), sigma, reference = spectrum(steps), 0.7, random_field(1, 1, H, W, seed=2)
+    D = torch.from_numpy(idctn(np.sqrt(taken * S * (1 + L) ** tilt) * sigma, norm="ortho"))[None, None]
+    noise = torch.tensor([sigma], dtype=torch.float64)
+    within = discrepancy_guard(reference + D, reference, noise, steps, allowance=0.0) - reference
+    share = share_by_definition(D, within, steps, sigma)
+    assert (share > 0) == partly or tilt > 0
+    torch.testing.assert_close(guard_by_modes(reference + D, reference, noise, steps), reference + share * within)
+
+
+def test_noise_is_followed_and_what_no_noise_explains_is_given_back():
+    reference = random_field(1, 1, H, W, seed=2)
+    sigma = torch.ones(1).double()
+    D = 0.9 * noise_height(5)
+    found = guard_by_modes(reference - D, reference, sigma, (1.0, 1.0)) - reference
+    assert (found + D).norm() < 0.25 * D.norm()
+    for harm in (3 * noise_height(5), 0.2 * noise_height(5)):
+        assert torch.equal(guard_by_modes(reference - harm, reference, sigma, (1.0, 1.0)), reference)
+
+
+def test_slopes_decide_with_masks_and_weights():
+    """e by hand; weights count by their mean."""
+    mask, g = MASKS["disk"](H, W), torch.zeros(1, 2, H, W, dtype=torch.float64)
+    S, L = spectrum((1.0, 1.0))
+    reference = torch.zeros(1, 1, H, W, dtype=torch.float64)
+    for size, expected in ((0.3, 0.0), (0.5, 0.5), (0.6, 1.0), (0.775, 0.5), (1.0, 0.0)):
+        z = torch.where(mask, random_field(1, 1, H, W, seed=3), 0)
+        inside_x, inside_y = (mask[..., 1:] & mask[..., :-1]), (mask[..., 1:, :] & mask[..., :-1, :])
+        energy = (z.diff(dim=-1) * inside_x).square().sum() + (z.diff(dim=-2) * inside_y).square().sum()
+        z = z * (size * (S * L).mean() * float(mask.sum()) / energy).sqrt()
+        for weight in (None, torch.full_like(z, 5.0)):
+            found = guard_by_slopes(z, reference, torch.ones(1).double(), fields(g, mask, weight))
+            torch.testing.assert_close(found, expected * z, atol=1e-12, rtol=1e-9)
+
+
+def test_each_surface_has_its_own_guard_and_unknown_noise_changes_nothing():
+    reference, D = random_field(3, 1, H, W), torch.cat([0.8 * noise_height(k) for k in range(3)])
+    weight = torch.ones(3, 1, H, W, dtype=torch.float64)
+    weight[1, :, 3:9] = 2.0
+    noise = torch.tensor([1.0, 1.0, torch.nan]).double()
+    given = fields(torch.zeros(3, 2, H, W, dtype=torch.float64), None, weight)
+    together = guard(reference + D, reference, given, noise)
+    for k in range(3):
+        alone = fields(given.gradient[k : k + 1], None, weight[k : k + 1])
+        one = slice(k, k + 1)
+        torch.testing.assert_close(guard((reference + D)[one], reference[one], alone, noise[one]), together[one])
+    torch.testing.assert_close(together[2], (reference + D)[2])
+
+
+def test_derivative_where_all_of_it_is_followed():
+    reference, S = random_field(1, 1, H, W), spectrum((1.0, 1.0))[0]
+    D = torch.from_numpy(idctn(np.sqrt(0.5 * S), norm="ortho"))[None, None]
+    noise = torch.ones(1).double()
+    assert_gradients(lambda z, r: guard_by_modes(z, r, noise, (1.0, 1.0)), reference + D, reference)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["plane", "saddle", "sphere", "gaussians"])
+def test_without_noise_it_is_least_squares(name, dtype):
+    if name == "plane":
+        gradient = torch.tensor([0.3, -0.7], dtype=dtype).view(1, 2, 1, 1).expand(1, 2, 24, 20)
+    else:
+        gradient = SURFACES[name]((24, 20), dtype=dtype).gradient
+    plain = LeastSquares()(gradient)
+    assert (DLS(n_iter=3)(gradient) - plain).abs().max() <= 1e-5 * plain.abs().max()
+
+
+def test_one_argument_away_is_the_bare_iteration():
+    g = bumps(2, 24, 20)
+    options = {"patch_size": 4, "n_atoms": 16, "n_iter": 4, "tol": 0.0}
+    bare = DLS(**options, select=False)(g)
+    torch.testing.assert_close(DLS(**options, mu=noise_level(g))(g), bare)  # a threshold that was asked for
+    torch.testing.assert_close(DLS(**options, mu=noise_level(g), select="guard")(g), DLS(**options)(g))
+    torch.testing.assert_close(DLS(**options, data_term=Huber())(g), DLS(**options, data_term=Huber(), select=False)(g))
+    with pytest.raises(ValueError, match="'auto', 'guard', False, True"):
+        DLS(select="risk")
+    with pytest.raises(ValueError, match="not to Huber"):
+        DLS(select="guard", data_term=Huber())
+
+
+@pytest.mark.slow
+def test_no_harm_and_a_gain_on_surfaces():
+    """Draws that chose no constant; rows as in benchmarks/quality/gains.py, smaller."""
+    for name in ("tent", "peaks", "saddle", "fractal", "chirp"):
+        surface = SURFACES[name](64)
+        for snr in (5, 20, 40, 60):
+            g = torch.cat([add_noise(surface.gradient, snr, torch.Generator().manual_seed(k)) for k in range(3)])
+            truth = surface.height.expand(3, -1, -1, -1)
+            errors = [
+                (rmse(z, truth).mean(), (1 - ssim(z, truth, surface.data_range)).mean())
+                for z in (LeastSquares()(g), DLS(n_iter=15, tol=0)(g))
+            ]
+            for plain, guarded in zip(*errors, strict=True):
+                assert guarded < 1.08 * plain + 1e-6, (name, snr)
+            if snr == 5 and name in ("tent", "peaks", "saddle"):
+                assert errors[1][0] < 0.95 * errors[0][0], name
