@@ -52,7 +52,7 @@ CALLS = {
     "convert_normals": {"normals": field(3)},
     "dct2": {"x": field(1)},
     "dct_dictionary": {},
-    "denoise_normals": NORMALS,
+    "denoise_normals": NORMALS | {"sigma": torch.ones(1)},
     "depth_to_points": {"depth": field(1), "camera": camera()},
     "dlnv_normals": PHOTOMETRIC | {"n_iter": 1},
     "dlpi_normals": PHOTOMETRIC | {"n_iter": 1},
