@@ -41,6 +41,7 @@ from .integrators import MEstimator as MEstimator
 from .integrators import MumfordShah as MumfordShah
 from .integrators import Proximal as Proximal
 from .integrators import RobustResult as RobustResult
+from .integrators import Shapelets as Shapelets
 from .integrators import SlopeDLS as SlopeDLS
 from .integrators import SlopeDLSResult as SlopeDLSResult
 from .integrators import SpectralRegularization as SpectralRegularization

@@ -69,6 +69,7 @@ INTEGRATORS: Registry[Integrator] = Registry(
         "frankot_chellappa": "FrankotChellappa",
         "horn_brooks": "HornBrooks",
         "line_integral": "LineIntegral",
+        "shapelets": "Shapelets",
         "harker_oleary": "HarkerOLeary",
         "spectral_regularization": "SpectralRegularization",
         "tikhonov_regularization": "TikhonovRegularization",

@@ -67,6 +67,7 @@ METHODS: dict[str, Method] = {
         no={"functional_transforms_agree": "it stops when a value says so, in plain operations, which vmap refuses"},
         exact={"default": {"relaxation": 1.5}},
     ),
+    "shapelets": Method(no={"plane_is_exact": "a plane is not periodic"}),
     "spectral_regularization": Method(no={"plane_is_exact": "a few cosines do not make a plane"}),
     "weighted_least_squares": Method(
         {"floor": 0.1}, tol=1e-4, no=ONE_SCALE, exact={"default": {"floor": 0.1, **TIGHT}}

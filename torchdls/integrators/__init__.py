@@ -8,6 +8,7 @@ from torchdls.integrators.classic import (
     HornBrooks,
     LeastSquares,
     LineIntegral,
+    Shapelets,
     SpectralRegularization,
     TikhonovRegularization,
 )
@@ -26,6 +27,7 @@ from torchdls.integrators.robust import (
 from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
 
 __all__ = [
+    "Shapelets",
     "AnisotropicDiffusion",
     "Bilateral",
     "Huber",
