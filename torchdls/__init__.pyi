@@ -24,6 +24,7 @@ from .geometry import normals_to_gradient as normals_to_gradient
 from .integrators import DLS as DLS
 from .integrators import INTEGRATORS as INTEGRATORS
 from .integrators import L1 as L1
+from .integrators import AlphaSurface as AlphaSurface
 from .integrators import AnisotropicDiffusion as AnisotropicDiffusion
 from .integrators import Bilateral as Bilateral
 from .integrators import DLSResult as DLSResult

@@ -70,6 +70,7 @@ INTEGRATORS: Registry[Integrator] = Registry(
         "horn_brooks": "HornBrooks",
         "line_integral": "LineIntegral",
         "shapelets": "Shapelets",
+        "alpha_surface": "AlphaSurface",
         "harker_oleary": "HarkerOLeary",
         "spectral_regularization": "SpectralRegularization",
         "tikhonov_regularization": "TikhonovRegularization",

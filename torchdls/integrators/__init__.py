@@ -3,6 +3,7 @@
 from torchdls._registry import INTEGRATORS
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic import (
+    AlphaSurface,
     FrankotChellappa,
     HarkerOLeary,
     HornBrooks,
@@ -27,6 +28,7 @@ from torchdls.integrators.robust import (
 from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
 
 __all__ = [
+    "AlphaSurface",
     "Shapelets",
     "AnisotropicDiffusion",
     "Bilateral",

@@ -1,5 +1,6 @@
 """Classic integrators: one solve or one transform each."""
 
+from torchdls.integrators.classic.alpha_surface import AlphaSurface
 from torchdls.integrators.classic.fourier import FrankotChellappa
 from torchdls.integrators.classic.global_least_squares import (
     HarkerOLeary,
@@ -12,6 +13,7 @@ from torchdls.integrators.classic.line_integral import LineIntegral
 from torchdls.integrators.classic.shapelets import Shapelets
 
 __all__ = [
+    "AlphaSurface",
     "Shapelets",
     "FrankotChellappa",
     "HarkerOLeary",
