@@ -27,6 +27,7 @@ from .integrators import L1 as L1
 from .integrators import AlphaSurface as AlphaSurface
 from .integrators import AnisotropicDiffusion as AnisotropicDiffusion
 from .integrators import Bilateral as Bilateral
+from .integrators import BSpline as BSpline
 from .integrators import DLSResult as DLSResult
 from .integrators import Exact as Exact
 from .integrators import FrankotChellappa as FrankotChellappa

@@ -71,6 +71,7 @@ INTEGRATORS: Registry[Integrator] = Registry(
         "line_integral": "LineIntegral",
         "shapelets": "Shapelets",
         "alpha_surface": "AlphaSurface",
+        "b_spline": "BSpline",
         "harker_oleary": "HarkerOLeary",
         "spectral_regularization": "SpectralRegularization",
         "tikhonov_regularization": "TikhonovRegularization",

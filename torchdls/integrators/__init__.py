@@ -4,6 +4,7 @@ from torchdls._registry import INTEGRATORS
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic import (
     AlphaSurface,
+    BSpline,
     FrankotChellappa,
     HarkerOLeary,
     HornBrooks,
@@ -28,6 +29,7 @@ from torchdls.integrators.robust import (
 from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
 
 __all__ = [
+    "BSpline",
     "AlphaSurface",
     "Shapelets",
     "AnisotropicDiffusion",

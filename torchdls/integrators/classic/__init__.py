@@ -1,6 +1,7 @@
 """Classic integrators: one solve or one transform each."""
 
 from torchdls.integrators.classic.alpha_surface import AlphaSurface
+from torchdls.integrators.classic.b_spline import BSpline
 from torchdls.integrators.classic.fourier import FrankotChellappa
 from torchdls.integrators.classic.global_least_squares import (
     HarkerOLeary,
@@ -13,6 +14,7 @@ from torchdls.integrators.classic.line_integral import LineIntegral
 from torchdls.integrators.classic.shapelets import Shapelets
 
 __all__ = [
+    "BSpline",
     "AlphaSurface",
     "Shapelets",
     "FrankotChellappa",
