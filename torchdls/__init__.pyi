@@ -41,6 +41,7 @@ from .integrators import LeastSquares as LeastSquares
 from .integrators import LineIntegral as LineIntegral
 from .integrators import MEstimator as MEstimator
 from .integrators import MumfordShah as MumfordShah
+from .integrators import PartialIntegrability as PartialIntegrability
 from .integrators import Proximal as Proximal
 from .integrators import RobustResult as RobustResult
 from .integrators import Shapelets as Shapelets

@@ -72,6 +72,7 @@ INTEGRATORS: Registry[Integrator] = Registry(
         "shapelets": "Shapelets",
         "alpha_surface": "AlphaSurface",
         "b_spline": "BSpline",
+        "partial_integrability": "PartialIntegrability",
         "harker_oleary": "HarkerOLeary",
         "spectral_regularization": "SpectralRegularization",
         "tikhonov_regularization": "TikhonovRegularization",

@@ -77,6 +77,14 @@ METHODS: dict[str, Method] = {
         },
         exact={"default": {"n_iter": 3, "solve_tol": 1e-13}},
     ),
+    "partial_integrability": Method(
+        tol=1e-3,
+        no={
+            **ONE_SCALE,
+            "functional_transforms_agree": "edges are chosen by values, in plain operations, which vmap refuses",
+        },
+        exact={"default": {"solve_tol": 1e-13}},
+    ),
     "spectral_regularization": Method(no={"plane_is_exact": "a few cosines do not make a plane"}),
     "weighted_least_squares": Method(
         {"floor": 0.1}, tol=1e-4, no=ONE_SCALE, exact={"default": {"floor": 0.1, **TIGHT}}

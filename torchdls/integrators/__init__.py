@@ -10,6 +10,7 @@ from torchdls.integrators.classic import (
     HornBrooks,
     LeastSquares,
     LineIntegral,
+    PartialIntegrability,
     Shapelets,
     SpectralRegularization,
     TikhonovRegularization,
@@ -29,6 +30,7 @@ from torchdls.integrators.robust import (
 from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
 
 __all__ = [
+    "PartialIntegrability",
     "BSpline",
     "AlphaSurface",
     "Shapelets",

@@ -11,9 +11,11 @@ from torchdls.integrators.classic.global_least_squares import (
 from torchdls.integrators.classic.horn_brooks import HornBrooks
 from torchdls.integrators.classic.least_squares import LeastSquares
 from torchdls.integrators.classic.line_integral import LineIntegral
+from torchdls.integrators.classic.partial_integrability import PartialIntegrability
 from torchdls.integrators.classic.shapelets import Shapelets
 
 __all__ = [
+    "PartialIntegrability",
     "BSpline",
     "AlphaSurface",
     "Shapelets",
