@@ -61,6 +61,7 @@ CALLS = {
     "height_to_points": {"height": field(1)},
     "hillshade": {"height": field(1)},
     "idct2": {"x": field(1)},
+    "integrate_scattered": {"points": torch.rand(9, 2), "slopes": torch.rand(9, 2), "at": torch.rand(4, 2)},
     "lights_from_ball": {"images": torch.rand(LIGHTS, H, W), "ball": mask()[0]},
     "log_depth_to_depth": {"log_depth": field(1), "scale": torch.ones(1, 1, 1, 1)},
     "low_rank_normals": PHOTOMETRIC,

@@ -53,6 +53,7 @@ from .integrators import TotalVariation as TotalVariation
 from .integrators import Unroll as Unroll
 from .integrators import WeightedLeastSquares as WeightedLeastSquares
 from .integrators import dls_objective as dls_objective
+from .integrators import integrate_scattered as integrate_scattered
 from .io import load_camera as load_camera
 from .io import load_field as load_field
 from .io import load_height as load_height

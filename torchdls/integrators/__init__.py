@@ -14,6 +14,7 @@ from torchdls.integrators.classic import (
     Shapelets,
     SpectralRegularization,
     TikhonovRegularization,
+    integrate_scattered,
 )
 from torchdls.integrators.dls import DLS, DLSResult, Exact, Implicit, Proximal, Unroll, dls_objective
 from torchdls.integrators.robust import (
@@ -30,6 +31,7 @@ from torchdls.integrators.robust import (
 from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
 
 __all__ = [
+    "integrate_scattered",
     "PartialIntegrability",
     "BSpline",
     "AlphaSurface",

@@ -12,9 +12,11 @@ from torchdls.integrators.classic.horn_brooks import HornBrooks
 from torchdls.integrators.classic.least_squares import LeastSquares
 from torchdls.integrators.classic.line_integral import LineIntegral
 from torchdls.integrators.classic.partial_integrability import PartialIntegrability
+from torchdls.integrators.classic.scattered import integrate_scattered
 from torchdls.integrators.classic.shapelets import Shapelets
 
 __all__ = [
+    "integrate_scattered",
     "PartialIntegrability",
     "BSpline",
     "AlphaSurface",
