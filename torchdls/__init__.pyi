@@ -4,6 +4,7 @@ from .dictionary import KSVD as KSVD
 from .dictionary import LEARNERS as LEARNERS
 from .dictionary import DinoKat as DinoKat
 from .dictionary import FixedDictionary as FixedDictionary
+from .dictionary import Focuss as Focuss
 from .dictionary import Learner as Learner
 from .dictionary import SoupDIL as SoupDIL
 from .dictionary import Unitary as Unitary

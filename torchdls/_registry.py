@@ -96,6 +96,7 @@ LEARNERS: Registry[Learner] = Registry(
         "fixed": "FixedDictionary",
         "dino_kat": "DinoKat",
         "unitary": "Unitary",
+        "focuss": "Focuss",
     }
 )
 

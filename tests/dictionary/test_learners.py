@@ -8,7 +8,17 @@ import torch
 
 import torchdls
 from tests.helpers import DISK, assert_gradients, assert_unchanged, random_field, seeded
-from torchdls import DLS, KSVD, LEARNERS, SURFACES, DinoKat, FixedDictionary, SoupDIL, orthogonal_matching_pursuit
+from torchdls import (
+    DLS,
+    KSVD,
+    LEARNERS,
+    SURFACES,
+    DinoKat,
+    FixedDictionary,
+    Focuss,
+    SoupDIL,
+    orthogonal_matching_pursuit,
+)
 
 F64 = torch.float64
 
@@ -98,7 +108,7 @@ def test_pursuit_batches_and_derivatives():
 
 
 ALL = [SoupDIL(), SoupDIL("block", "keep"), KSVD(), KSVD(n_nonzero=3, steps=3), FixedDictionary(), DinoKat(),
-       DinoKat(2, (3, 4), "block")]  # fmt: skip
+       DinoKat(2, (3, 4), "block"), Focuss(), Focuss(1.0, 2)]  # fmt: skip
 
 
 @pytest.mark.parametrize("learner", ALL, ids=repr)
@@ -129,7 +139,7 @@ def test_no_pass_raises_the_cost(learner, shared):
         torch.testing.assert_close(alone[2], B[1:], atol=1e-8, rtol=1e-8)
 
 
-@pytest.mark.parametrize("learner", ALL[:5], ids=repr)
+@pytest.mark.parametrize("learner", [*ALL[:5], Focuss()], ids=repr)
 def test_learn_false_keeps_the_dictionary(learner):
     P, D = random_field(1, 9, 30), unit(random_field(1, 9, 12, seed=2))
     with assert_unchanged(D):
@@ -138,7 +148,7 @@ def test_learn_false_keeps_the_dictionary(learner):
     torch.testing.assert_close(R, P - D @ B)
 
 
-@pytest.mark.parametrize("learner", [SoupDIL(), KSVD(), KSVD(n_nonzero=2), DinoKat(), DinoKat(2)], ids=repr)
+@pytest.mark.parametrize("learner", [SoupDIL(), KSVD(), KSVD(n_nonzero=2), DinoKat(), DinoKat(2), Focuss()], ids=repr)
 def test_derivatives_of_a_pass(learner):
     P, D = random_field(1, 4, 6), low_rank_atoms(2, 2, 3, 2)[None]
 

@@ -1,6 +1,7 @@
 """Dictionaries of patches: initial dictionaries, sparse coding, and the learners (SOUP-DIL first among them)."""
 
 from torchdls._registry import LEARNERS
+from torchdls.dictionary.focuss import Focuss
 from torchdls.dictionary.initial import dct_dictionary
 from torchdls.dictionary.learners import KSVD, DinoKat, FixedDictionary, Learner, SoupDIL
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
@@ -12,6 +13,7 @@ __all__ = [
     "LEARNERS",
     "DinoKat",
     "FixedDictionary",
+    "Focuss",
     "Learner",
     "SoupDIL",
     "Unitary",

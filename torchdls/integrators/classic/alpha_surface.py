@@ -92,6 +92,5 @@ class AlphaSurface(Integrator):
         return IntegrationResult(self._solve(fields, graph.v, graph.w * kept), count, ~more)
 
     def _solve(self, fields: Fields, v: Tensor, w: Tensor, z0: Tensor | None = None) -> Tensor:
-        settings = {"tol": self.solve_tol, "max_iter": self.max_iter}
-        found = solve(v, w, fields.anchor, fields.anchor_weight, z0=z0, pixel_size=fields.steps, **settings)
-        return found.height
+        anchors = fields.anchor, fields.anchor_weight
+        return solve(v, w, *anchors, tol=self.solve_tol, max_iter=self.max_iter, z0=z0, pixel_size=fields.steps).height
