@@ -187,6 +187,24 @@ def test_unused_atoms_of_ksvd_become_the_worst_patches():
     torch.testing.assert_close(D[0], unit(worst))
 
 
+def test_ksvd_to_a_residual():
+    """Codes are those of the pursuit; later passes meet the target with fewer atoms."""
+    P, D, tol = random_field(1, 9, 200), unit(random_field(1, 9, 14, seed=2)), 1.5
+    _, _, B = KSVD(tol=tol)(*start(P, D), 0.0, learn=False)
+    torch.testing.assert_close(B, orthogonal_matching_pursuit(P, D, tol=tol))
+    step, used = start(P, D), []
+    for _ in range(8):
+        R, D, B = step = KSVD(tol=tol)(*step, 0.0)
+        torch.testing.assert_close(R, P - D @ B)
+        used.append(int((B != 0).sum()))
+    assert used[-1] < 0.95 * used[0]
+    R, _, B = KSVD(tol=tol)(*step, 0.0, learn=False)
+    assert (R.square().sum(1) <= tol + 1e-9).all()
+    assert B.any(1).float().mean() > 0.5
+    with pytest.raises(ValueError, match="KSVD: tol=-1"):
+        KSVD(tol=-1.0)
+
+
 # ---- planted dictionaries
 
 
