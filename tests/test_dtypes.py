@@ -52,6 +52,7 @@ CALLS = {
     "convert_normals": {"normals": field(3)},
     "dct2": {"x": field(1)},
     "dct_dictionary": {},
+    "denoise_height": {"height": field(1), "sigma": 0.1, "patch_size": 4, "n_passes": 1},
     "depth_to_points": {"depth": field(1), "camera": camera()},
     "dlnv_normals": PHOTOMETRIC | {"n_iter": 1},
     "dlpi_normals": PHOTOMETRIC | {"n_iter": 1},

@@ -1,6 +1,7 @@
 """Dictionaries of patches: initial dictionaries, sparse coding, and the learners (SOUP-DIL first among them)."""
 
 from torchdls._registry import LEARNERS
+from torchdls.dictionary.denoise import denoise_height
 from torchdls.dictionary.focuss import Focuss
 from torchdls.dictionary.initial import dct_dictionary
 from torchdls.dictionary.learners import KSVD, DinoKat, FixedDictionary, Learner, SoupDIL
@@ -18,6 +19,7 @@ __all__ = [
     "SoupDIL",
     "Unitary",
     "dct_dictionary",
+    "denoise_height",
     "orthogonal_matching_pursuit",
     "soup_dil_sweep",
 ]
