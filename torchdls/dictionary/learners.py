@@ -186,9 +186,10 @@ class KSVD:
     that no patch uses become the patches that are fitted worst. Not for `torch.compile` or `vmap`: the pursuit works on
     the patches that are not yet done.
 
-    With `tol`, a patch takes no more atoms than bring |p - D b|^2 down to it, and a residual below that counts as `tol`:
-    codes lower max(|p - D b|^2, tol) + mu^2 ||b||_0, of equal costs that of fewer atoms is kept, and atoms lower the
-    residual. The cost without `tol` may then rise. For patches of n pixels with noise of standard deviation s, tol = n (1.15 s)^2 is usual; mu may then be 0.
+    With `tol`, a patch takes no more atoms than bring |p - D b|^2 down to it, and a residual below that counts as
+    `tol`: codes lower max(|p - D b|^2, tol) + mu^2 ||b||_0, of equal costs that of fewer atoms is kept, and atoms lower
+    the residual. The cost without `tol` may then rise. For patches of n pixels with noise of standard deviation s,
+    tol = n (1.15 s)^2 is usual; mu may then be 0.
 
     Args:
         n_nonzero: most atoms of a patch; None leaves it to mu.
