@@ -49,6 +49,7 @@ from .integrators import RobustResult as RobustResult
 from .integrators import Shapelets as Shapelets
 from .integrators import SlopeDLS as SlopeDLS
 from .integrators import SlopeDLSResult as SlopeDLSResult
+from .integrators import SpectralPath as SpectralPath
 from .integrators import SpectralRegularization as SpectralRegularization
 from .integrators import TikhonovRegularization as TikhonovRegularization
 from .integrators import TotalVariation as TotalVariation

@@ -73,6 +73,7 @@ INTEGRATORS: Registry[Integrator] = Registry(
         "alpha_surface": "AlphaSurface",
         "b_spline": "BSpline",
         "partial_integrability": "PartialIntegrability",
+        "spectral_path": "SpectralPath",
         "harker_oleary": "HarkerOLeary",
         "spectral_regularization": "SpectralRegularization",
         "tikhonov_regularization": "TikhonovRegularization",

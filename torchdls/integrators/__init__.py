@@ -12,6 +12,7 @@ from torchdls.integrators.classic import (
     LineIntegral,
     PartialIntegrability,
     Shapelets,
+    SpectralPath,
     SpectralRegularization,
     TikhonovRegularization,
     integrate_scattered,
@@ -31,6 +32,7 @@ from torchdls.integrators.robust import (
 from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult
 
 __all__ = [
+    "SpectralPath",
     "integrate_scattered",
     "PartialIntegrability",
     "BSpline",

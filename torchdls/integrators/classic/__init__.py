@@ -14,8 +14,10 @@ from torchdls.integrators.classic.line_integral import LineIntegral
 from torchdls.integrators.classic.partial_integrability import PartialIntegrability
 from torchdls.integrators.classic.scattered import integrate_scattered
 from torchdls.integrators.classic.shapelets import Shapelets
+from torchdls.integrators.classic.spectral_path import SpectralPath
 
 __all__ = [
+    "SpectralPath",
     "integrate_scattered",
     "PartialIntegrability",
     "BSpline",
