@@ -37,7 +37,8 @@ def test_the_leading_eigenvector_is_that_of_the_dense_matrix():
 def walk(e):
     """Heights of each pixel from its edge, in the order of the walk: (from, to) pairs."""
     start = np.unravel_index(e.argmax(), e.shape)
-    seen, edges, front = {tuple(map(int, start))}, [], []
+    seen, edges = {tuple(map(int, start))}, []
+    front: list = []
 
     def look(i, j):
         for a, b in ((i + di, j + dj) for di, dj in NEIGHBOURS):

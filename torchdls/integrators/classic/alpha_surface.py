@@ -24,7 +24,8 @@ class AlphaSurface(Integrator):
     with sigma the noise level of the slopes, from the median of |curl|. alpha = 0 is the tree alone, alpha = inf least
     squares over all edges. Edges are in or out, so a wild slope that stays out has no influence; but one that the tree
     holds is believed, and as noise adds up along a tree, few edges agree where there is much of it. For completeness:
-    `L1` does its work better, and a jump or wild samples are for `L1`, `MEstimator` or `Bilateral`.
+    with 2 % of wild samples on smooth relief at 20 dB (64 x 64) the error is .5 to .6 of that of least squares, where
+    `L1` brings it to .13 to .42.
 
     The derivative is that of the last solve: which edges are in is taken as fixed.
 

@@ -24,9 +24,10 @@ class SpectralPath(Integrator):
     largest entry the path goes on to the neighbour of largest entry, and where it is stuck, back to the best place that
     it left: a spanning tree. Heights add up along its edges by the trapezium rule.
 
-    **For teaching**: most slopes are not used, so noise adds up as a random walk. `LineIntegral` averages many paths
-    and is better, `LeastSquares` uses every slope and is far better. The bend k depends on the steepness, so heights do
-    not scale with the slopes.
+    **For teaching**: half of the slopes are not used, so noise adds up as a random walk. Measured on 64 x 64 pixels of
+    smooth relief at 20 dB, the error is 3.5 to 5 times that of `LeastSquares`, 1.5 to 2.5 times that of `LineIntegral`.
+    The path goes around some wild slopes (2 %: .73 to .93 of `LeastSquares`), where `L1` does far better. The bend k
+    depends on the steepness, so heights do not scale with the slopes.
 
     Needs the full rectangle and equal trust: takes no mask, weights or anchors. On the constant: zero mean. The
     derivative is that of the sums along the tree, which is taken as fixed.
