@@ -26,8 +26,8 @@ class PartialIntegrability(Integrator):
     no pixel loses its hold. Two solves.
 
     A lesson rather than a tool: it about halves the error from 2 % of wild slopes, and `L1` does better; and a jump of
-    constant height has no curl along it and passes unseen, where `MEstimator` or `Bilateral` see it. Edges that you know
-    to be wrong are released by weights of 0 in `torchdls.solve`.
+    constant height has no curl along it and passes unseen, where `MEstimator` or `Bilateral` see it. Edges that you
+    know to be wrong are released by weights of 0 in `torchdls.solve`.
 
     The derivative is that of the second solve: which edges are released is taken as fixed.
 
