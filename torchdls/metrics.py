@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_field, check_fit
+from torchdls._precision import full_precision
 from torchdls._statistics import midpoint_median
 from torchdls.operators import as_pixel_size
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 _WINDOW = 11  # scikit-image's gaussian window: sigma 1.5 cut at 3.5 sigma
 
 
+@full_precision
 def rmse(height: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tensor:
     """Root of the mean squared error modulo the constant.
 
@@ -55,6 +57,7 @@ def rmse(height: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tenso
     return torch.linalg.vector_norm(centred, dim=(-3, -2, -1)) / count.sqrt()
 
 
+@full_precision
 def ssim(height: Tensor, reference: Tensor, data_range: float, mask: Tensor | None = None) -> Tensor:
     """Structural similarity of the heights, their levels aligned first.
 
@@ -106,6 +109,7 @@ def ssim(height: Tensor, reference: Tensor, data_range: float, mask: Tensor | No
     return _mean(torch.where(complete, values, 0), complete).reshape(given.shape[:-3]).to(given.dtype)
 
 
+@full_precision
 def mean_angular_error(
     height: Tensor,
     reference: Tensor,
@@ -152,6 +156,7 @@ def mean_angular_error(
     return _mean(torch.where(cells, _angle(slopes, truth), 0), cells)
 
 
+@full_precision
 def mean_absolute_depth_error(depth: Tensor, reference: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean absolute depth error after scaling by the median ratio: the measure of the DiLiGenT objects.
 

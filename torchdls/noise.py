@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_field, check_fit, require
+from torchdls._precision import full_precision
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls._tracing import holds_everywhere
 from torchdls.operators import as_pixel_size, dst2, edge_slopes
@@ -21,6 +22,7 @@ _KEPT = math.erf(_CUT / math.sqrt(2))
 _TRIMMED_VARIANCE = 1 - _CUT * math.sqrt(2 / math.pi) * math.exp(-_CUT * _CUT / 2) / _KEPT  # of a cut standard normal
 
 
+@full_precision
 def noise_level(
     gradient: Tensor,
     mask: Tensor | None = None,
@@ -81,22 +83,39 @@ def noise_level(
         >>> round(float(torchdls.noise_level(noisy)), 2)
         0.1
     """
-    dx, dy = as_pixel_size(pixel_size)
-    _check(gradient, mask, weight)
+    steps = as_pixel_size(pixel_size)
+    check_field("noise_level", "gradient", gradient, 2)
     single = gradient.ndim == 3
     if single:
         gradient = gradient[None]
         mask, weight = (None if t is None else t[None] for t in (mask, weight))
+    _check(gradient, mask, weight)
+    sigma, told = noise_if_told(gradient, mask, weight, steps)
+    if not holds_everywhere(told):
+        raise ValueError("noise_level: a mask (or the positive weights) holds no complete cell of 2 x 2 pixels")
+    return sigma[0] if single else sigma
+
+
+def noise_if_told(
+    gradient: Tensor, mask: Tensor | None, weight: Tensor | None, pixel_size: tuple[float, float]
+) -> tuple[Tensor, Tensor]:
+    """`noise_level` of checked fields (N,), and whether a cell tells it (N,): 0 where none does.
+
+    Fields of a single row or column have no cell; a mask may leave none.
+    """
+    n, (dx, dy) = gradient.shape[0], pixel_size  # not len(), which a graph for every batch size cannot follow
+    if min(gradient.shape[-2:]) < 2:
+        return gradient.new_zeros(n), torch.zeros(n, dtype=torch.bool, device=gradient.device)
     v, w = edge_slopes(gradient, mask, weight)
     curl = cell_curl(v, (dx, dy))
     scale = math.hypot(dx, dy)
     if w is None:
         sigma = torch.minimum(_robust_scale(curl / scale), _spectral_scale(curl, dx, dy))
-    else:
-        unit, cells = _normalised(curl, w, dx, dy)
-        local, spectral = _robust_scale(unit, cells), _spectral_scale(unit * scale, dx, dy)
-        sigma = torch.where(_stationary(mask, weight), torch.minimum(local, spectral), local)
-    return sigma[0] if single else sigma
+        return sigma, torch.ones(n, dtype=torch.bool, device=gradient.device)
+    unit, cells = _normalised(curl, w, dx, dy)
+    local, spectral = _robust_scale(unit, cells), _spectral_scale(unit * scale, dx, dy)
+    sigma = torch.where(_stationary(mask, weight), torch.minimum(local, spectral), local)
+    return sigma, cells.flatten(1).any(1)
 
 
 def _normalised(curl: Tensor, w: Tensor, dx: float, dy: float) -> tuple[Tensor, Tensor]:
@@ -107,8 +126,6 @@ def _normalised(curl: Tensor, w: Tensor, dx: float, dy: float) -> tuple[Tensor, 
     """
     edges = cell_edges(w)
     cells = (edges > 0).all(1)
-    if not holds_everywhere(cells.flatten(1).any(1)):
-        raise ValueError("noise_level: a mask (or the positive weights) holds no complete cell of 2 x 2 pixels")
     halves = 0.5 / torch.where(cells[:, None], edges, 1)
     variance = dx * dx * halves[:, :2].sum(1) + dy * dy * halves[:, 2:].sum(1)
     return torch.where(cells, curl, 0) / variance.sqrt(), cells
@@ -140,7 +157,7 @@ def _robust_scale(x: Tensor, valid: Tensor | None = None) -> Tensor:
     limit = _CUT * masked_median(magnitude.flatten(1), live.flatten(1)) / NORMAL_MEDIAN
     kept = live & (magnitude <= limit[:, None, None])
     norm = torch.linalg.vector_norm(torch.where(kept, x, 0), dim=(-2, -1))  # derivative 0, not NaN, at 0
-    return norm / (_TRIMMED_VARIANCE * kept.sum((-2, -1), dtype=x.dtype)).sqrt()
+    return norm / (_TRIMMED_VARIANCE * kept.sum((-2, -1), dtype=x.dtype).clamp(min=1)).sqrt()
 
 
 @table
@@ -285,6 +302,7 @@ def _projected_spectra(n: int, pixel_size: tuple[float, float]) -> tuple[Tensor,
     return xx, yy, g_x * g_y.conj() * q
 
 
+@full_precision
 def noise_sigma(gradient: Tensor, snr_db: float, mask: Tensor | None = None) -> Tensor:
     """Standard deviation of the noise on one gradient sample at a signal-to-noise ratio.
 
@@ -327,6 +345,7 @@ def noise_sigma(gradient: Tensor, snr_db: float, mask: Tensor | None = None) -> 
     return power.sqrt() * 10 ** (-snr_db / 20)
 
 
+@full_precision
 def add_noise(
     gradient: Tensor, snr_db: float, generator: torch.Generator | None = None, mask: Tensor | None = None
 ) -> Tensor:

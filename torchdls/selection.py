@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_alike, check_field, require
+from torchdls._precision import full_precision
 from torchdls.noise import height_noise, noise_level
 from torchdls.operators import as_pixel_size, dct2, edge_slopes, idct2
 from torchdls.operators.tables import table
@@ -49,12 +50,12 @@ def discrepancy_guard(
     """
     shape = (height.shape[-2], height.shape[-1])
     band = _bands(*shape, like=height).long().flatten()
-    n_bands = int(_bands(*shape, like=height).max()) + 1
+    n_bands = _most_bands(*shape)
     variance = height_noise(shape, height, pixel_size)
     difference = dct2(height - reference)
     weight = torch.where(band.view(shape) > 0, 1 / torch.where(variance > 0, variance, 1), 0)
     removed = _band_sums((difference.square() * weight).flatten(1), band, n_bands)
-    count = torch.bincount(band, minlength=n_bands).to(height.dtype)
+    count = _band_sums(torch.ones_like(variance).view(1, -1), band, n_bands)[0]
     allowed = noise[:, None].square() * (count + (2 * count).sqrt())
     beyond = removed > allowed
     beyond[:, 0] = False
@@ -65,6 +66,11 @@ def discrepancy_guard(
 def _band_sums(energy: Tensor, band: Tensor, n_bands: int) -> Tensor:
     """(N, n_bands) sums of (N, H W) over the bands."""
     return energy.new_zeros(energy.shape[0], n_bands).index_add(1, band, energy)
+
+
+def _most_bands(h: int, w: int) -> int:
+    """A bound of the number of bands: every mode has a radius below sqrt(2 h w)."""
+    return (2 + math.floor(math.log(max(1.0, math.sqrt(2 * h * w))) / math.log(_RATIO))) * _SECTORS
 
 
 @table
@@ -113,7 +119,7 @@ def sure_guard(height: Tensor, reference: Tensor, change: Tensor, moved: Tensor,
     """
     shape = (height.shape[-2], height.shape[-1])
     band = _bands(*shape, like=height).long().flatten()
-    n_bands = int(_bands(*shape, like=height).max()) + 1
+    n_bands = _most_bands(*shape)
     difference, along, push = (dct2(x) for x in (height - reference, change - moved, moved))
     energy = _band_sums(difference.square().flatten(1), band, n_bands)
     divergence = _band_sums((along * push).flatten(1), band, n_bands)
@@ -144,6 +150,7 @@ class Selection(NamedTuple):
     risk: Tensor
 
 
+@full_precision
 def select(
     integrate: Callable[[Tensor], Tensor],
     gradient: Tensor,

@@ -141,7 +141,6 @@ METHODS: dict[str, Method] = {
             "learner": SoupDIL(unused="keep"),
         },
         tol=1e-4,
-        smallest=4,
         no={
             **ONE_DICTIONARY,
             "plane_is_exact": "codes below mu are lost; it holds for mu='auto' and the block order (see test_dls.py)",

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from tests.helpers import random_field, seeded
-from torchdls import AnisotropicDiffusion, HornBrooks, SlopeDLS, WeightedLeastSquares
+from tests.helpers.methods import Options, method
+from torchdls import INTEGRATORS, AnisotropicDiffusion, HornBrooks, LeastSquares, SlopeDLS, WeightedLeastSquares
 
 
 def test_anisotropic_diffusion_stays_where_it_has_arrived():
@@ -53,3 +54,79 @@ def test_horn_brooks_meets_anchors_far_from_zero(weight):
     r[..., 0] = weight
     error = (HornBrooks()(g, anchor=truth, anchor_weight=r) - truth).abs().max()
     assert float(error) < 1e-4 * float(truth.max() - truth.min())
+
+
+# ---- every method of the registry, in its forms
+
+
+FORMS: list[tuple[str, Options]] = [(name, {}) for name in INTEGRATORS]
+FORMS += [("slope_dls", {"recipe": "quick"}), ("slope_dls", {"recipe": "plain"}), ("slope_dls", {"sigma": 0.0})]
+FORMS += [("dls", {"learner": "dino_kat"}), ("dls", {"learner": "fixed"}), ("dls", {"mu": "auto"})]
+FORMS += [("l1", {"smoothing": 0.0}), ("total_variation", {"smoothing": 0.0}), ("mumford_shah", {"width": 0.0})]
+FORMS += [("m_estimator", {"loss": "tukey"}), ("least_squares", {"boundary": "dirichlet"})]
+
+
+def still(kind, dtype):
+    """A field of zeros, of a plane, and of the paraboloid that every method takes for solved."""
+    y, x = torch.meshgrid(torch.arange(13, dtype=dtype), torch.arange(12, dtype=dtype), indexing="ij")
+    slopes = {"zero": (0 * x, 0 * x), "plane": (0 * x + 0.3, 0 * x - 0.7), "paraboloid": (0.02 * x, -0.03 * y)}
+    return torch.stack(slopes[kind])[None]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", ["zero", "plane", "paraboloid"])
+@pytest.mark.parametrize("name, options", FORMS)
+def test_a_derivative_where_nothing_moves(name, options, kind, dtype):
+    """It is there, finite, and of the size that a change of slopes can have."""
+    integrator, g = method(name).build(name, **options), still(kind, dtype)
+    mask = torch.ones(1, 1, 13, 12, dtype=torch.bool)
+    mask[..., :3, :4] = mask[..., 7, 7] = False
+    for given in ((), (mask,)) if "mask" in integrator.accepts else ((),):
+        leaf = g.clone().requires_grad_()
+        z = integrator(leaf, *given)
+        assert z.requires_grad
+        assert z.isfinite().all()
+        (z * random_field(*z.shape, seed=2).to(z)).sum().backward()
+        assert leaf.grad.isfinite().all()
+        assert leaf.grad.abs().max() < 1e3
+
+
+BORDERS = {
+    "left": (..., slice(None), slice(0, 1)),
+    "right": (..., slice(None), slice(-1, None)),
+    "top": (..., slice(0, 1), slice(None)),
+    "bottom": (..., slice(-1, None), slice(None)),
+}
+
+
+@pytest.mark.parametrize("side", BORDERS)
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_slopes_along_one_border(name, side):
+    """Scale, flips and a transposition pass through, wherever the only slopes are."""
+    full, g = random_field(1, 2, 10, 8), torch.zeros(1, 2, 10, 8, dtype=torch.float64)
+    g[BORDERS[side]] = full[BORDERS[side]]
+    integrator, promises = method(name).build(name), method(name).no
+    z = integrator(g)
+    close = max(1e-7, method(name).tol) * float(z.abs().max())
+
+    def same(found, expected):
+        torch.testing.assert_close(found, expected, rtol=0, atol=close)
+
+    if "scales_with_the_slopes" not in promises:
+        same(integrator(8 * g) / 8, z)
+        same(integrator(-g), -z)
+    if "follows_flips" not in promises:
+        signs = torch.tensor([-1.0, 1.0], dtype=torch.float64).view(1, 2, 1, 1)
+        same(integrator(g.flip(-1) * signs).flip(-1), z)
+        same(integrator(-g.flip(-2) * signs).flip(-2), z)
+    if "follows_a_transpose" not in promises:
+        same(integrator(g.mT.flip(1)).mT, z)
+
+
+@pytest.mark.parametrize("name", ["dls", "slope_dls"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_field_without_noise_is_integrated_by_least_squares(name, dtype):
+    """What rounding leaves of the curl of a plane is no noise, and nothing is learned from it."""
+    for g in (still("zero", dtype), still("plane", dtype)):
+        z = LeastSquares()(g)
+        torch.testing.assert_close(INTEGRATORS[name]()(g), z, rtol=0, atol=1e-5 * float(z.abs().max()))

@@ -66,13 +66,13 @@ def test_least_squares_is_two_transforms():
 
 @pytest.mark.parametrize("size", [64, 96])
 def test_least_squares_of_a_small_field_is_four_products(size):
-    """Beside the products: the gain, and the two sums that tell whether values are finite."""
+    """Beside the products: the gain, two sums that tell whether values are finite, and how the solve went."""
     g = noisy(size)
     LeastSquares()(g)  # fills the tables of this size
     with Operations(large=g.numel() // 2) as seen:
         LeastSquares()(g)
     assert seen.count["mm"] + seen.count["bmm"] == 4
-    assert seen.count.total() <= 9
+    assert seen.count.total() <= 12
 
 
 def test_an_iteration_of_the_masked_solve():

@@ -1,5 +1,7 @@
 """Photometric stereo on rendered images: exact where the model is exact, robust where the method claims to be."""
 
+import inspect
+
 import numpy as np
 import pytest
 import torch
@@ -238,8 +240,9 @@ def test_wrong_arguments_are_named(method):
         method(images, lights, mask=images[:, :1])
     with pytest.raises(ValueError, match="NaN"):
         method(images / 0, lights)
-    with pytest.raises(ValueError, match="shadow=1"):
-        method(images, lights, shadow=1)
+    if "shadow" in inspect.signature(method).parameters:
+        with pytest.raises(ValueError, match="shadow=1"):
+            method(images, lights, shadow=1)
 
 
 def test_wrong_options_are_named():

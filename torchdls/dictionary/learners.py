@@ -17,6 +17,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold
@@ -220,6 +221,7 @@ class KSVD:
         if not 0 <= self.tol < math.inf:
             raise ValueError(f"KSVD: tol={self.tol!r} given, a number of at least 0 is needed")
 
+    @full_precision
     def __call__(self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, learn: bool = True) -> Step:
         """One pass: pursuit, then atoms."""
         N, _, L = R.shape

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdls._checks import check_alike, check_real
+from torchdls._precision import full_precision
 from torchdls._tracing import is_recorded
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold, shrink
 
@@ -26,6 +27,7 @@ _GROUP = 16
 _CHUNK, _SHORTEST = 65536, 4096
 
 
+@full_precision
 def soup_dil_sweep(
     P: Tensor,
     D: Tensor,
@@ -89,6 +91,7 @@ def soup_dil_sweep(
     return D, B
 
 
+@full_precision
 def residual_sweep(
     R: Tensor,
     D: Tensor,

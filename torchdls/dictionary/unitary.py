@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.dictionary.learners import Step, check_options
 from torchdls.dictionary.thresholds import Threshold, shrink
 
@@ -44,6 +45,7 @@ class Unitary:
     def __post_init__(self) -> None:
         check_options(self)
 
+    @full_precision
     def __call__(self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, learn: bool = True) -> Step:
         """One pass: codes, then the dictionary."""
         n, K = D.shape[-2:]

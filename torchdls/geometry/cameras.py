@@ -8,10 +8,12 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_field, check_real
+from torchdls._precision import full_precision
 from torchdls.geometry.conventions import NORMAL_CONVENTIONS, permute
 from torchdls.operators import as_pixel_size
 
 
+@full_precision
 def log_depth_to_depth(log_depth: Tensor, scale: float | Tensor = 1.0) -> Tensor:
     """Depth Z = scale * exp(u) from the integrated log depth u.
 
@@ -31,6 +33,7 @@ def log_depth_to_depth(log_depth: Tensor, scale: float | Tensor = 1.0) -> Tensor
     return scale * log_depth.exp()
 
 
+@full_precision
 def depth_to_points(depth: Tensor, camera: Tensor) -> Tensor:
     """Points X = Z K^-1 (column, row, 1) of a depth (N, 1, H, W): (N, 3, H, W), x right, y up, z to the viewer.
 
@@ -46,6 +49,7 @@ def depth_to_points(depth: Tensor, camera: Tensor) -> Tensor:
     return permute(points, NORMAL_CONVENTIONS["opencv"])
 
 
+@full_precision
 def height_to_points(height: Tensor, pixel_size: float | Sequence[float] = 1.0) -> Tensor:
     """Points (column dx, -row dy, z) of a height (N, 1, H, W): (N, 3, H, W), x right, y up, z to the viewer.
 

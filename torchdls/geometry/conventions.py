@@ -9,8 +9,10 @@ from torchdls._checks import check_field
 from torchdls._conventions import GRADIENT_CONVENTIONS as GRADIENT_CONVENTIONS
 from torchdls._conventions import NORMAL_CONVENTIONS as NORMAL_CONVENTIONS
 from torchdls._conventions import Axes as Axes
+from torchdls._precision import full_precision
 
 
+@full_precision
 def convert_normals(normals: Tensor, source: str = "opengl", target: str = "opengl") -> Tensor:
     """Express normals (N, 3, H, W) or (3, H, W) of convention `source` in convention `target`.
 
@@ -25,6 +27,7 @@ def convert_normals(normals: Tensor, source: str = "opengl", target: str = "open
     return permute(permute(normals, frame[0]), inverse_axes(frame[1]))
 
 
+@full_precision
 def convert_gradient(gradient: Tensor, source: str = "image", target: str = "image") -> Tensor:
     """Express a gradient (N, 2, H, W) or (2, H, W) of convention `source` in convention `target`.
 

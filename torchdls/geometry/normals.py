@@ -26,6 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from torchdls._checks import check_field, check_fit, check_real
+from torchdls._precision import full_precision
 from torchdls.geometry.cameras import apply_matrix, check_camera, inverse_camera, pixel_grid
 from torchdls.geometry.conventions import NORMAL_CONVENTIONS, inverse_axes, lookup, permute
 from torchdls.operators import as_pixel_size
@@ -62,6 +63,7 @@ class ConventionGuess(NamedTuple):
     residual: dict[str, float]
 
 
+@full_precision
 def normals_to_gradient(
     normals: Tensor,
     convention: str = "opengl",
@@ -130,6 +132,7 @@ def normals_to_gradient(
     return GradientField(gradient, inside, blind.sum((-3, -2, -1)))
 
 
+@full_precision
 def gradient_to_normals(
     gradient: Tensor,
     convention: str = "opengl",
@@ -244,6 +247,7 @@ class GradientToNormals(_Conversion):
             """As `forward`."""
 
 
+@full_precision
 def guess_convention(
     normals: Tensor,
     mask: Tensor | None = None,

@@ -14,6 +14,7 @@ from torch.nn.utils import parametrize
 
 from torchdls._checks import check_field, require
 from torchdls._options import plain, same, shown
+from torchdls._precision import full_precision
 from torchdls._tracing import all_finite
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.fields import Fields as Fields
@@ -73,6 +74,7 @@ class Integrator(nn.Module, ABC):
         super().__init__()
         self.pixel_size = as_pixel_size(pixel_size)
 
+    @full_precision
     def forward(
         self,
         gradient: Tensor,
@@ -147,6 +149,7 @@ class Integrator(nn.Module, ABC):
     def _integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels from checked fields; what a subclass provides."""
 
+    @full_precision
     def solve(
         self,
         gradient: Tensor,

@@ -7,6 +7,7 @@ from typing import Generic, Protocol, TypeVar
 
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.integrators.base import Callback as Callback
 from torchdls.integrators.base import Fields, Integrator
 
@@ -37,6 +38,7 @@ class Iterative(Integrator, Generic[Result]):
         """Height (N, 1, H, W) in pixels."""
         return self._iterate(fields).height
 
+    @full_precision
     def solve(
         self,
         gradient: Tensor,

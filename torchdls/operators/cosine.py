@@ -8,12 +8,14 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_real, require
+from torchdls._precision import full_precision
 from torchdls.operators.tables import table
 
 # Up to this side two products with the cosine matrix beat the FFT and its reordering passes (measured on a CPU).
 MATRIX_LIMIT = 64
 
 
+@full_precision
 def dct2(x: Tensor) -> Tensor:
     r"""Orthonormal two-dimensional DCT-II.
 
@@ -52,6 +54,7 @@ def dct2(x: Tensor) -> Tensor:
     return torch.cat([head, tail[..., 1 : (w + 1) // 2].flip(-1)], -1)
 
 
+@full_precision
 def idct2(x: Tensor) -> Tensor:
     """Inverse, and transpose, of `dct2`.
 

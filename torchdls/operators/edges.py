@@ -10,9 +10,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdls._checks import check_field, check_fit
+from torchdls._precision import full_precision
 from torchdls._tracing import is_recorded
 
 
+@full_precision
 def edge_slopes(
     gradient: Tensor, mask: Tensor | None = None, weight: Tensor | None = None
 ) -> tuple[Tensor, Tensor | None]:
@@ -65,6 +67,7 @@ def edge_slopes(
     return v, both * 0.5
 
 
+@full_precision
 def slope_divergence(gradient: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
     """A^T v (N, 1, H, W) for forward differences A and the slopes v = `edge_slopes(gradient)` of equal trust.
 

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdls._checks import check_field
+from torchdls._precision import full_precision
 
 Kernel = tuple[tuple[float, ...], ...]
 
@@ -88,11 +89,13 @@ class GradientOperator:
             *(sum(abs(t) for row in k for t in row) / d for k, d in zip(self.kernels, self.pixel_size, strict=True))
         )
 
+    @full_precision
     def __call__(self, z: Tensor) -> Tensor:
         """Slopes (N, 2, H, W) of a height (N, 1, H, W); TypeError or ValueError if it is not one."""
         check_field("GradientOperator", "z", z, 1)
         return torch.cat([_correlate(z, k, d) for k, d in zip(self.kernels, self.pixel_size, strict=True)], -3)
 
+    @full_precision
     def adjoint(self, g: Tensor) -> Tensor:
         """Exact transpose: (N, 2, H, W) -> (N, 1, H, W). Slopes that `__call__` leaves absent are not read."""
         check_field("GradientOperator", "g", g, 2)
@@ -166,7 +169,7 @@ def _correlate(z: Tensor, kernel: Kernel, spacing: float) -> Tensor:
     h, w = z.shape[-2:]
     margins = _margins(taps, top, left)
     if not _fits(margins, h, w):
-        return torch.zeros_like(z)
+        return F.pad(z[..., :0], (0, w))  # zeros of which z is still a variable
     rows, columns = _window(taps, top, left, h, w)
     window = z[..., rows, columns]
     if pair := _two_taps(taps):
@@ -186,7 +189,7 @@ def _correlate_transpose(g: Tensor, kernel: Kernel, spacing: float) -> Tensor:
     h, w = g.shape[-2:]
     margins = _margins(taps, top, left)
     if not _fits(margins, h, w):
-        return torch.zeros_like(g)
+        return F.pad(g[..., :0], (0, w))
     g = g[..., margins[2] : h - margins[3], margins[0] : w - margins[1]]
     if pair := _two_taps(taps):
         dim, first, last = pair

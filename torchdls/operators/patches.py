@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_alike, check_dtype, check_field, check_real, require
+from torchdls._precision import full_precision
 from torchdls._tracing import is_recorded
 
 
@@ -70,10 +71,14 @@ class Patches:
     def grid(self, shape: Sequence[int]) -> tuple[int, int]:
         """Patches down and across an image of shape (.., H, W); ValueError if it is smaller than a patch."""
         h, w = shape[-2:]
-        if h < self._size[0] or w < self._size[1]:
+        if not self.fit(shape):
             raise ValueError(f"image of {h} x {w} pixels is smaller than a patch of {self._size[0]} x {self._size[1]}")
         rows, columns = ((m - p + s - 1) // s + 1 for m, p, s in zip((h, w), self._size, self._stride, strict=True))
         return rows, columns
+
+    def fit(self, shape: Sequence[int]) -> bool:
+        """Whether an image of shape (.., H, W) holds a patch."""
+        return all(m >= p for m, p in zip(shape[-2:], self._size, strict=True))
 
     def tile(self, shape: Sequence[int]) -> bool:
         """Whether the patches of an image of shape (.., H, W) lie side by side: every pixel is in one of them."""
@@ -91,6 +96,7 @@ class Patches:
         last = count - 1 if high >= last_start else high // stride
         return slice(min(first * stride, last_start), min(last * stride, last_start) + size), slice(first, last + 1)
 
+    @full_precision
     def extract(self, z: Tensor) -> Tensor:
         """All patches: (N, 1, H, W) -> (N, n, L), L = rows * columns of `grid`; each patch is contiguous in memory.
 
@@ -100,6 +106,7 @@ class Patches:
         require(z.ndim == 4, f"Patches: z {tuple(z.shape)} given, (N, 1, H, W) is needed")
         return self._gather(z) if torch.compiler.is_compiling() else _Extract.apply(z, self)
 
+    @full_precision
     def adjoint(self, x: Tensor, shape: Sequence[int]) -> Tensor:
         """Exact transpose, summing overlaps: (N, n, L) -> (N, 1, H, W), with (H, W) the last two of `shape`."""
         size = (shape[-2], shape[-1])

@@ -8,12 +8,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.operators.tables import table
 
 # Up to this length a product with the sine matrix beats the FFT of twice the length (measured on a CPU).
 _MATRIX_LIMIT = 64
 
 
+@full_precision
 def dst2(x: Tensor) -> Tensor:
     r"""Orthonormal two-dimensional DST-I.
 

@@ -8,27 +8,41 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
+
+from torchdls._tracing import is_fake
 
 
 def table(build: Callable[..., Tensor], maxsize: int = 64) -> Callable[..., Tensor]:
     """Cache a table that `build(*args)` computes on the CPU in float64, in the dtype and on the device of `like`.
 
     Tables are constants: they are built outside autograd and outside inference mode, so one table serves every caller.
-    While a graph is being traced nothing is cached, since a traced tensor must not outlive its graph.
+    What a compiler follows is not cached, since a traced tensor must not outlive its graph; nor is a fake one.
     """
 
     def make(args: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
         with torch.inference_mode(False), torch.no_grad():
             values = build(*args)
-            if not values.is_floating_point():  # positions stay integers
-                dtype = dtype.to_complex() if values.is_complex() else values.dtype
+            if values.is_complex():
+                dtype = torch.complex128 if dtype == torch.float64 else torch.complex64
+            elif not values.is_floating_point():  # positions stay integers
+                dtype = values.dtype
             return values.to(dtype).to(device)
 
     cached = lru_cache(maxsize)(make)
 
     @wraps(build)
     def lookup(*args: Any, like: Tensor) -> Tensor:
-        find = make if torch.compiler.is_compiling() else cached
-        return find(args, like.dtype, like.device)
+        if torch.compiler.is_dynamo_compiling() or _symbolic(args):
+            return make(args, like.dtype, like.device)
+        if torch.compiler.is_compiling():  # `torch.export` takes a tensor from outside of its graph for a constant
+            with _disable_current_modes():
+                return cached(args, like.dtype, like.device)
+        return make(args, like.dtype, like.device) if is_fake(like) else cached(args, like.dtype, like.device)
 
     return lookup
+
+
+def _symbolic(args: tuple[Any, ...]) -> bool:
+    """Whether a size is left open, in a graph for every size."""
+    return any(_symbolic(a) if isinstance(a, tuple) else isinstance(a, torch.SymInt) for a in args)

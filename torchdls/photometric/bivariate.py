@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from torchdls._precision import full_precision
 from torchdls.photometric.least_squares import lit_samples
 from torchdls.photometric.model import PhotometricResult, check, result
 
@@ -16,6 +17,7 @@ _RELAX = 1.6
 _PENALTY = 0.02  # of the splitting, in units of the mean curvature
 
 
+@full_precision
 def bivariate_normals(
     images: Tensor,
     lights: Tensor,

@@ -14,6 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.dictionary import SoupDIL, dct_dictionary
 from torchdls.operators import Patches
 from torchdls.photometric.least_squares import lit_samples
@@ -23,6 +24,7 @@ _LEARNER = SoupDIL("block")
 Auto = Literal["auto"]
 
 
+@full_precision
 def dlpi_normals(
     images: Tensor,
     lights: Tensor,
@@ -94,6 +96,7 @@ def dlpi_normals(
     return result(b, samples._replace(lit=inside))
 
 
+@full_precision
 def dlnv_normals(
     images: Tensor,
     lights: Tensor,

@@ -5,9 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.photometric.model import PhotometricResult, check, fit, result
 
 
+@full_precision
 def woodham(
     images: Tensor,
     lights: Tensor,

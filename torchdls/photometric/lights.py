@@ -8,10 +8,12 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_alike, check_real
+from torchdls._precision import full_precision
 
 _BRIGHTEST = 0.9  # pixels of at least this part of the brightest one are the highlight
 
 
+@full_precision
 def lights_from_ball(images: Tensor, ball: Tensor) -> Tensor:
     r"""Directions of distant lights from their highlights on a mirror ball, seen from afar.
 

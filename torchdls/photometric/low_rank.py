@@ -7,11 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls._tracing import is_concrete
 from torchdls.photometric.least_squares import lit_samples
 from torchdls.photometric.model import PhotometricResult, check, covariance, fit, result
 
 
+@full_precision
 def low_rank_normals(
     images: Tensor,
     lights: Tensor,
@@ -160,6 +162,7 @@ class _Shrinkage(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
+    @full_precision
     def backward(ctx: Any, change: Tensor, *_: Tensor) -> tuple[Tensor, None]:
         return _Shrinkage._differential(ctx, change), None
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_fit
+from torchdls._precision import full_precision
 from torchdls.operators import GradientOperator, as_pixel_size
 from torchdls.photometric.model import Samples, check
 from torchdls.solvers.cg import conjugate_gradients
@@ -65,6 +66,7 @@ class _Scene(NamedTuple):
         return GradientOperator("forward", self.steps).adjoint(s[:, 0] + behind)
 
 
+@full_precision
 def refine(
     height: Tensor,
     images: Tensor,

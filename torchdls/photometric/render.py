@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
 from torchdls._checks import check_dtype, check_field, check_fit, check_real
+from torchdls._precision import full_precision
 from torchdls.operators import as_pixel_size
 from torchdls.photometric.model import check_lights, count_of, shading
 
@@ -37,6 +38,7 @@ def ring_of_lights(
     return lights.to(dtype).to(device)
 
 
+@full_precision
 def render(
     normals: Tensor,
     lights: Tensor,
@@ -93,7 +95,9 @@ def render(
     images = albedo * lambert.clamp(min=0)
     if highlight:
         strength = lights.norm(dim=-1, keepdim=True)
-        half = normalize(lights / strength + lights.new_tensor([0.0, 0.0, 1.0]), dim=-1)
+        half = normalize(
+            lights / strength + torch.tensor([0.0, 0.0, 1.0], dtype=lights.dtype, device=lights.device), dim=-1
+        )
         gloss = shading(n, half).clamp(min=0) ** shininess
         images = images + highlight * strength[..., None] * torch.where(lambert > 0, gloss, 0)
     if shadow is not None:
@@ -116,6 +120,7 @@ def _check_beside(normals: Tensor, albedo: Tensor | float, shadow: Tensor | None
         check_fit("render", "shadow", shadow, normals, "normals", channels=(1, count), dtype=torch.bool)
 
 
+@full_precision
 def cast_shadows(height: Tensor, lights: Tensor, pixel_size: float | Sequence[float] = 1.0) -> Tensor:
     """Where the surface itself stands between a pixel and a light.
 

@@ -7,10 +7,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.photometric.least_squares import lit_samples
 from torchdls.photometric.model import _PAIRS, PhotometricResult, check, fit, result, shading
 
 
+@full_precision
 def sparse_normals(
     images: Tensor,
     lights: Tensor,

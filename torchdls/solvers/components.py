@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._tracing import only_shapes
 from torchdls.operators import edge_ends, edge_slopes
 
 
@@ -189,6 +190,8 @@ def free_constants(w: Tensor, r: Tensor | None, least: float = 0.0) -> Gauge:
     Where all anchor weights are above `least`, no constant needs care.
     """
     nothing = torch.empty_like(w[:, 0, :0, 0])
+    if only_shapes(w):
+        return Gauge(nothing.long(), nothing, nothing)
     if r is not None and bool(((r > least) | ((r == 0) & (edge_ends(w) == 0))).all()):  # as in every z-step of DLS
         return Gauge(nothing.long(), nothing, nothing)
     labels = connected_components(w > 0).flatten(1)

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls._tracing import is_concrete, is_recorded
 from torchdls.operators import dct2, idct2, neumann_eigenvalues, slope_divergence
 from torchdls.operators.cosine import MATRIX_LIMIT, cosine_matrix, from_half_spectrum, half_spectrum, mirrored
@@ -104,7 +105,7 @@ def _line_divergence(n: int, d: float) -> Tensor:
 def _few_at_a_time(height: LinearMap, x: Tensor) -> Tensor:
     """Heights (N, 1, H, W) of a batch x (N, C, H, W), as many surfaces at once as stay in the cache."""
     several = max(1, _IN_CACHE // (x.shape[-2] * x.shape[-1]))
-    if len(x) <= several:
+    if torch.compiler.is_compiling() or len(x) <= several:  # a graph serves every batch size
         return height(x)
     if is_recorded(x):
         return torch.cat([height(part) for part in x.split(several)])
@@ -202,6 +203,7 @@ class _Direct(torch.autograd.Function):
         ctx.save_for_forward(*saved)
 
     @staticmethod
+    @full_precision
     def backward(ctx: Any, dz: Tensor) -> tuple[Tensor | None, ...]:
         r, z = ctx.saved_tensors
         adjoint = _Direct.apply(dz, r, ctx.pixel_size)

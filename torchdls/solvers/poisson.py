@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_alike, check_real
-from torchdls._tracing import all_finite
+from torchdls._precision import full_precision
+from torchdls._tracing import all_finite, only_shapes
 from torchdls.operators import GradientOperator, as_pixel_size
 from torchdls.operators.edges import edge_ends, present_edges
 from torchdls.solvers.cg import CGResult, LinearMap, conjugate_gradients
@@ -73,6 +74,7 @@ class _Setting(NamedTuple):
     max_iter: int
 
 
+@full_precision
 def solve(
     v: Tensor,
     w: Tensor | None = None,
@@ -144,6 +146,8 @@ def solve(
         return _finite(direct_result(_on_rectangle(v, anchor, r, setting.pixel_size)))
     w = present_edges(v) if w is None else w.expand_as(v)
     r = None if r is None else r.expand_as(v[:, :1])
+    if only_shapes(v):
+        return _shapes_alone(v, w, anchor, r)
     return _finite(_in_general(Problem(v, w, anchor, r, z0, setting.pixel_size), setting))
 
 
@@ -185,10 +189,19 @@ def _in_general(problem: Problem, setting: _Setting) -> SolveResult:
     return SolveResult((z + lift) * unit, *told)
 
 
+def _shapes_alone(v: Tensor, w: Tensor, anchor: Tensor | None, r: Tensor | None) -> SolveResult:
+    """A result for tensors without values, linked to all of them: the iterations could not tell when to stop."""
+    z = GradientOperator().adjoint(w * v)
+    if r is not None:
+        z = z + (r if anchor is None else r * anchor)
+    return direct_result(z)
+
+
 def direct_result(z: Tensor) -> SolveResult:
     """What a direct solve gave, as a result of `solve`."""
-    zeros = torch.zeros(z.shape[0], dtype=z.dtype, device=z.device)
-    return SolveResult(z, zeros.long(), zeros, zeros == 0)
+    n, device = z.shape[0], z.device
+    steps, residual = torch.zeros(n, dtype=torch.int64, device=device), torch.zeros(n, dtype=z.dtype, device=device)
+    return SolveResult(z, steps, residual, torch.ones(n, dtype=torch.bool, device=device))
 
 
 def _A(setting: _Setting) -> GradientOperator:
@@ -305,6 +318,7 @@ class _Solve(torch.autograd.Function):
         ctx.setting = setting
 
     @staticmethod
+    @full_precision
     def backward(ctx: Any, dz: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         z, w, r, bounds, *gauge = ctx.saved_tensors
         constants = Gauge(*gauge).constants(dz, r)
@@ -449,7 +463,7 @@ def _warn(residual: Tensor, converged: Tensor, setting: _Setting) -> None:
         f"solve: {int((~converged).sum())} of {len(converged)} surfaces stopped after {setting.max_iter} iterations "
         f"at a relative residual of up to {float(residual.max()):.1e}, above tol={setting.tol:.1e}",
         ConvergenceWarning,
-        stacklevel=6,  # the caller of `solve`
+        stacklevel=7,  # the caller of `solve`
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 import torch
 from torch import Tensor, nn
 
+from torchdls._precision import full_precision
 from torchdls._tracing import holds_everywhere, is_recorded
 from torchdls.integrators.base import Integrator
 from torchdls.integrators.classic.axis_modes import BASES, Basis, Modes, axis_modes, expand
@@ -238,6 +239,7 @@ class TikhonovRegularization(GlobalLeastSquares):
         first = change(z)
         return z - d * first + d.square() * change(first)
 
+    @full_precision
     def forward(
         self,
         gradient: Tensor,

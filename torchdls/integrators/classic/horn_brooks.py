@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchdls._tracing import is_concrete, seen_everywhere
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.operators import GradientOperator, edge_slopes
 from torchdls.operators.edges import edge_ends
@@ -78,7 +79,8 @@ class HornBrooks(Integrator):
         if fields.anchor is not None:  # less its constant, which sweeps would take for ever to find
             level = gauge.constants(r * fields.anchor, r.expand_as(level))
             b = b + r * (fields.anchor - level)
-        diagonal = edge_ends(w / w.new_tensor(fields.steps).square().view(1, 2, 1, 1)) + r
+        squares = torch.tensor(fields.steps, dtype=w.dtype, device=w.device).square().view(1, 2, 1, 1)
+        diagonal = edge_ends(w / squares) + r
         step = self.relaxation / torch.where(diagonal > 0, diagonal, 1)
         i, j = (torch.arange(n, device=b.device) for n in b.shape[-2:])
         colour = (i[:, None] + j) % 2 == 0
@@ -89,7 +91,7 @@ class HornBrooks(Integrator):
         for _ in range(self.max_iter):
             residual = b - a.adjoint(w * a(z)) - r * z
             active = active & (residual.detach().flatten(1).norm(dim=1) > goal)
-            if not bool(active.any()):
+            if seen_everywhere(~active):
                 break
             sweeps = sweeps + active
             turn = active.view(-1, 1, 1, 1)
@@ -97,6 +99,7 @@ class HornBrooks(Integrator):
             residual = b - a.adjoint(w * a(z)) - r * z
             z = z + torch.where(turn & ~colour, step * residual, 0)
         else:
-            message = f"HornBrooks: {int(active.sum())} of {len(b)} surfaces above tol={self.tol:g}"
-            warnings.warn(f"{message} after {self.max_iter} iterations", ConvergenceWarning, stacklevel=2)
+            if is_concrete(active):
+                message = f"HornBrooks: {int(active.sum())} of {len(b)} surfaces above tol={self.tol:g}"
+                warnings.warn(f"{message} after {self.max_iter} iterations", ConvergenceWarning, stacklevel=2)
         return IntegrationResult(gauge.settle(z) + level, sweeps, ~active)

@@ -67,14 +67,7 @@ class LeastSquares(Integrator):
 
     def _integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
-        if self._is_direct(fields):
-            return integrate_direct(fields.gradient, fields.steps)
         return self._solve_fields(fields).height
-
-    def _is_direct(self, fields: Fields) -> bool:
-        """Whether the solve is diagonal in the cosine basis: a full rectangle with equal weights and free borders."""
-        plain = fields.mask is None and fields.weight is None and fields.anchor is None
-        return plain and self.boundary == "neumann"
 
     def _report(self, fields: Fields) -> IntegrationResult:
         """The height, and how the solve went."""
@@ -89,7 +82,7 @@ class LeastSquares(Integrator):
         """The solve and how it went, from a warm start z0."""
         if self.boundary == "dirichlet":
             return solve_dirichlet(fields, tol=self.tol, max_iter=self.max_iter, z0=z0)
-        if self._is_direct(fields):
+        if fields.mask is None and fields.weight is None and fields.anchor is None:
             return direct_result(integrate_direct(fields.gradient, fields.steps))
         v, w, _ = self._data_term(fields)
         return solve(

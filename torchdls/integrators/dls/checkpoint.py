@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.dictionary.learners import FixedDictionary, SoupDIL
 from torchdls.dictionary.sweep_adjoint import Codes, Sweep
 from torchdls.integrators.dls.iteration import Settings, iterate, objective, settled, update_height
@@ -140,6 +141,7 @@ class _Run(torch.autograd.Function):
         return end.z, end.D.view_as(end.D), end.values, torch.stack(costs, 1), end.places, end.used, done
 
     @staticmethod
+    @full_precision
     def backward(ctx: Any, gz: Tensor, gD: Tensor, gv: Tensor, g_costs: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
             raise RuntimeError("DLS: Unroll(checkpoint=True) has first derivatives only; take Unroll() for second ones")

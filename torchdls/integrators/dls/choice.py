@@ -56,5 +56,5 @@ def choose_threshold(model: Problem, automatic: bool, run: Callable[[Tensor, Ten
             heights, fields.gradient, len(mus),
             noise=model.noise, norm=_NORM, least_cut=_LEAST_CUT, pixel_size=fields.steps,
         )  # fmt: skip
-    scale = fields.gradient.new_tensor(factors)[chosen.choice.clamp(min=0)]
+    scale = torch.tensor(factors, dtype=model.mu.dtype, device=model.mu.device)[chosen.choice.clamp(min=0)]
     return model._replace(mu=scale * model.mu, lam=torch.where(chosen.choice < 0, 0, model.lam))

@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchdls._tracing import in_plain_autograd, is_recorded
+from torchdls._precision import full_precision
+from torchdls._tracing import in_plain_autograd, is_recorded, only_shapes
 from torchdls.dictionary.thresholds import Threshold
 from torchdls.integrators.dls.problem import Problem
 from torchdls.operators import GradientOperator, Patches
@@ -107,6 +108,8 @@ class _FixedPoint(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         if z is not None and b is not None:
             return z.view_as(z), b.view_as(b)
+        if only_shapes(f_z):
+            return torch.empty_like(f_z), f_z.new_empty(free.shape)
         return _System(w, r, lam, D, free, valid, setting).solve(f_z, f_b)
 
     @staticmethod
@@ -119,6 +122,7 @@ class _FixedPoint(torch.autograd.Function):
         ctx.set_materialize_grads(False)
 
     @staticmethod
+    @full_precision
     def backward(ctx: Any, dz: Tensor | None, db: Tensor | None) -> tuple[Tensor | None, ...]:
         z, b, w, r, lam, D, free, valid = ctx.saved_tensors
         dz, db = torch.zeros_like(z) if dz is None else dz, None if db is None else db * free

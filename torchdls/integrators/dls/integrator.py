@@ -10,11 +10,12 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchdls._tracing import in_plain_autograd
+from torchdls._tracing import in_plain_autograd, seen_everywhere
 from torchdls.dictionary import dct_dictionary
 from torchdls.dictionary.learners import Learner
 from torchdls.integrators.base import Fields, Integrator
 from torchdls.integrators.classic.least_squares import LeastSquares
+from torchdls.integrators.data_term import anchored_cost
 from torchdls.integrators.dls.checkpoint import run_in_legs
 from torchdls.integrators.dls.choice import check_selectable, choose_threshold
 from torchdls.integrators.dls.implicit import implicit_derivative
@@ -27,7 +28,6 @@ from torchdls.integrators.dls.settings import (
     Learn,
     check_dictionary,
     check_run,
-    check_size,
     check_strength,
     choose_derivative,
     choose_height_step,
@@ -38,7 +38,7 @@ from torchdls.integrators.dls.settings import (
 from torchdls.integrators.dls.window import live_window
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.settling import run_until_settled
-from torchdls.noise import noise_level
+from torchdls.noise import noise_if_told
 from torchdls.operators import Patches
 from torchdls.solvers import remove_free_constants
 
@@ -105,9 +105,10 @@ class DLS(Iterative[DLSResult]):
         n_atoms: K, the number of atoms of the initial DCT dictionary; ignored if `dictionary` is given.
         lam: weight of the patch model; a number, a tensor (a number or one per surface), or "auto" (0.5).
         mu: threshold on the codes; a number, a tensor (a number or one per surface), or "auto": the noise
-            level of one gradient sample, which `noise_level` estimates from the non-integrable part of each field. A
-            list or tuple of numbers is a schedule, one for each of the `n_iter` iterations; no surface stops before its
-            last change.
+            level of one gradient sample, which `noise_level` estimates from the non-integrable part of each field;
+            where there is none, or no cell of 2 x 2 pixels tells it, the height is that of the data term alone. A list
+            or tuple of numbers is a schedule, one for each of the `n_iter` iterations; no surface stops before its last
+            change.
         n_iter: limit of iterations.
         data_term: an integrator built on the solve (*), which provides the data term and the first height.
         dictionary: initial dictionary (n, K), or (N, n, K) for each surface of a batch; atoms are brought to unit
@@ -199,8 +200,9 @@ class DLS(Iterative[DLSResult]):
 
     def _iterate(self, fields: Fields, callback: Callback | None = None) -> DLSResult:
         """The iterations, within the window of the patches that a mask leaves alive."""
-        check_size(fields.gradient, self.patches)
         noise = self._noise(fields)
+        if not self.patches.fit(fields.gradient.shape) or (isinstance(self.mu, str) and seen_everywhere(~(noise > 0))):
+            return self._without_patches(fields, noise)
         window = live_window(fields.mask, self.patches)
         fields = fields if window is None else window.crop(fields)
         problem = self._problem(fields, noise)
@@ -211,6 +213,17 @@ class DLS(Iterative[DLSResult]):
         if window is None:
             return result._replace(height=height)
         return result._replace(height=window.put_back(height), codes=window.put_codes_back(result.codes))
+
+    def _without_patches(self, fields: Fields, noise: Tensor) -> DLSResult:
+        """The surface of the data term alone, where no patch fits or none has noise to lose: nothing to iterate."""
+        z, D = self.data_term._integrate(fields), self._initial_dictionary(fields)
+        cost = anchored_cost(self.data_term._data_term(fields), fields, z)
+        rows, columns = self.patches.grid(z.shape) if self.patches.fit(z.shape) else (0, 0)
+        codes = z.new_zeros(len(z), D.shape[-1], rows * columns)
+        costs = cost[:, None].expand(-1, self.n_iter + 1)
+        nothing = torch.zeros_like(noise)
+        lam, mu = (per_surface(name, getattr(self, name), nothing) for name in ("lam", "mu"))
+        return DLSResult(z, D, codes, costs, noise, 0 * lam, mu, nothing == 0, nothing.long())
 
     @property
     def _settings(self) -> Settings:
@@ -267,6 +280,8 @@ class DLS(Iterative[DLSResult]):
         shape, N = gradient.shape[-2:], gradient.shape[0]
         lam = per_surface("lam", self.lam, _AUTO_LAM * torch.ones_like(noise))
         mu = per_surface("mu", self.mu, _AUTO_MU * noise)
+        if isinstance(self.mu, str):  # where there is no noise, or nothing tells it: least squares
+            lam, mu = (torch.where(noise > 0, t, 0) for t in (lam, mu))
         coverage = self.patches.coverage(shape, dtype=gradient.dtype, device=gradient.device)
         data = self.data_term._data_term(fields)
         schedule = self.mu if isinstance(self.mu, tuple) else None
@@ -278,19 +293,13 @@ class DLS(Iterative[DLSResult]):
         return Problem(fields, self.patches, coverage * mask, valid, data, noise, lam, mu, schedule)
 
     def _noise(self, fields: Fields) -> Tensor:
-        """(N,) noise of a gradient sample of mean weight; NaN where it cannot be told and mu does not need it."""
+        """(N,) noise of a gradient sample of mean weight; NaN where nothing tells it."""
         weight = fields.weight
         if weight is not None:  # a common factor of the weights is no news about the noise
             count = (weight > 0).sum((-3, -2, -1), keepdim=True).clamp(min=1)
             weight = weight * count / weight.sum((-3, -2, -1), keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
-        try:
-            return noise_level(fields.gradient, fields.mask, weight, fields.steps)
-        except ValueError as error:
-            if isinstance(self.mu, str):
-                raise ValueError(f"DLS: mu='auto' finds no noise level, give a number ({error})") from error
-            if self.select:
-                raise ValueError(f"DLS: select=True finds no noise level ({error})") from error
-            return fields.gradient.new_full((len(fields.gradient),), math.nan)
+        level, told = noise_if_told(fields.gradient, fields.mask, weight, fields.steps)
+        return torch.where(told, level, math.nan)
 
     def _initial_dictionary(self, fields: Fields) -> Tensor:
         D = self.dictionary.to(fields.gradient)

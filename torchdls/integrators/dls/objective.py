@@ -5,12 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.integrators.classic.least_squares import LeastSquares
 from torchdls.integrators.data_term import Quadratic
 from torchdls.integrators.dls.problem import patch_cost
 from torchdls.operators import Patches
 
 
+@full_precision
 def dls_objective(
     height: Tensor,
     gradient: Tensor,

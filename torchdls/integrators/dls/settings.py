@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchdls._registry import LEARNERS
+from torchdls._tracing import holds_everywhere
 from torchdls.dictionary.learners import DinoKat, FixedDictionary, Learner, SoupDIL
 from torchdls.integrators.dls.options import DERIVATIVES, HEIGHT_STEPS, Exact, Implicit, Proximal, Unroll, meant
 from torchdls.operators import Patches
@@ -130,14 +131,6 @@ def per_surface(name: str, value: float | Tensor | Sequence[float] | str, auto: 
     return value.reshape(-1).expand(auto.shape)
 
 
-def check_size(gradient: Tensor, patches: Patches) -> None:
-    """ValueError if the field is smaller than a patch."""
-    try:
-        patches.grid(gradient.shape)
-    except ValueError as error:
-        raise ValueError(f"DLS: gradient {tuple(gradient.shape)}: {error}") from error
-
-
 def check_dictionary(dictionary: Tensor, patches: Patches) -> None:
     """The initial dictionary must fit the patches and have no atom that is zero."""
     if not isinstance(dictionary, Tensor):
@@ -146,5 +139,5 @@ def check_dictionary(dictionary: Tensor, patches: Patches) -> None:
         wanted = f"(n, K) or (N, n, K) with n = {patches.n_pixels}"
         raise ValueError(f"DLS: dictionary {tuple(dictionary.shape)} given, {wanted} is needed")
     norms = dictionary.detach().norm(dim=-2)
-    if not bool((norms.isfinite() & (norms > 0)).all()):
+    if not holds_everywhere(norms.isfinite() & (norms > 0)):
         raise ValueError("DLS: dictionary has an atom that is zero or not finite")

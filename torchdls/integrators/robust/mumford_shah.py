@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.robust.base import Estimate, Robust
@@ -135,6 +136,7 @@ class MumfordShah(Robust):
     def _begin(self, fields: Fields, data: DataTerm) -> Estimate:
         return (huber_start(self, fields),)
 
+    @full_precision
     def indicator(
         self,
         height: Tensor,

@@ -17,7 +17,7 @@ from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.slope_dls.coding import Aggregate, Noise, SlopeScale, average
 from torchdls.integrators.slope_dls.outliers import replace_outliers
 from torchdls.integrators.slope_dls.runs import FOUR, QUICK, Run, smooth
-from torchdls.noise import noise_level
+from torchdls.noise import noise_if_told
 from torchdls.operators import GradientOperator, edge_slopes
 from torchdls.operators.edges import edge_ends, extend_edges
 from torchdls.selection import discrepancy_guard, probe, sure_guard
@@ -124,8 +124,8 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         learn: "plain" alone: learn the dictionary of the smallest patches; False codes them by cosines too.
         recipe: "blend", "quick" or "plain".
         sigma: standard deviation of one gradient sample of weight 1: a number, (N,), or a map (N, 1, H, W), which takes
-            the place of the weights in the coding. None estimates it with `noise_level`; fields of a single row or
-            column, which do not show it, are then integrated as they are.
+            the place of the weights in the coding. None estimates it with `noise_level`; fields without a complete
+            cell of 2 x 2 pixels, which do not show it, are then integrated as they are.
         guard: "discrepancy" (step 4, and the return to least squares); "sure" adds at the end a blend with least
             squares in every band by Stein's unbiased risk estimate, from a second run on probed data (twice the time);
             None for neither.
@@ -305,10 +305,8 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         """Level for a trust of 1, and the trust on the edges where it is not the same everywhere."""
         gradient, n = fields.gradient, fields.gradient.shape[0]
         sigma, weight = self.sigma, fields.weight
-        if sigma is None and min(gradient.shape[2:]) < 2:
-            level = gradient.new_zeros(n)  # without a cell nothing tells it
-        elif sigma is None:
-            level = noise_level(gradient, fields.mask, weight, fields.steps)
+        if sigma is None:
+            level, _ = noise_if_told(gradient, fields.mask, weight, fields.steps)
         else:
             level = torch.as_tensor(sigma, dtype=gradient.dtype, device=gradient.device)
             if level.ndim > 1:
