@@ -7,11 +7,13 @@ import math
 from torch import Tensor
 
 from torchdls._checks import check_field, require
+from torchdls._precision import full_precision
 from torchdls.dictionary.initial import dct_dictionary
 from torchdls.dictionary.learners import KSVD
 from torchdls.operators import Patches
 
 
+@full_precision
 def denoise_height(
     height: Tensor,
     sigma: float,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.dictionary.learners import Step, check_options
 
 _CHUNK = 1024  # patches worked on at once: each has an n x n system of its own
@@ -54,6 +55,7 @@ class Focuss:
         if not 0 < self.q <= 1:
             raise ValueError(f"Focuss: q={self.q!r} given, a number above 0 and at most 1 is needed")
 
+    @full_precision
     def __call__(self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, learn: bool = True) -> Step:
         """One pass: codes, then atoms."""
         level = torch.as_tensor(mu, dtype=R.dtype, device=R.device).reshape(-1, 1).expand(len(R), 1)

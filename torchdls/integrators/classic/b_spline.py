@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_alike, check_real, require
+from torchdls._precision import full_precision
 from torchdls.integrators.base import Fields, Integrator
 from torchdls.operators.tables import table
 
@@ -63,6 +64,7 @@ class BSpline(Integrator):
         height = rows.values @ self._coefficients(fields) @ columns.values.mT
         return height - height.mean((-2, -1), keepdim=True)
 
+    @full_precision
     def evaluate(self, gradient: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
         """Heights where the given rows and columns cross, anywhere between the pixels.
 
@@ -93,6 +95,7 @@ class BSpline(Integrator):
         height = self._finite((values[0] @ coefficients @ values[1].mT - mean) * self._unit)
         return height if gradient.ndim == 4 else height[0]
 
+    @full_precision
     def upsample(self, gradient: Tensor, factor: int) -> Tensor:
         """Heights on a grid that is `factor` times as fine, from the first pixel to the last.
 

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls._precision import full_precision
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic.curl_tree import CurlTree
 from torchdls.operators import GradientOperator
@@ -77,6 +78,7 @@ class PartialIntegrability(Integrator):
         found = self._solve(fields, graph.v, graph.w * ~self._released(fields, graph))
         return IntegrationResult(found.height, found.iterations, found.converged)
 
+    @full_precision
     def released(self, gradient: Tensor, mask: Tensor | None = None, weight: Tensor | None = None) -> Tensor:
         """The edges that are released.
 

@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_alike, check_real, require
+from torchdls._precision import full_precision
 
 
+@full_precision
 def integrate_scattered(
     points: Tensor, slopes: Tensor, at: Tensor, *, sigma: float | None = None, lam: float = 1e-6
 ) -> Tensor:
