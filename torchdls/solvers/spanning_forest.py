@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchdls._tracing import has_values
 from torchdls.solvers.components import connected_components
 
 
@@ -23,7 +24,7 @@ def spanning_forest(cost: Tensor, tie: Tensor, live: Tensor) -> Tensor:
         (N, 2, H, W) bool, the edges of the trees.
     """
     kept = torch.zeros_like(live)
-    if not bool(live.any()):
+    if not has_values(live) or not bool(live.any()):  # shapes alone choose nothing
         return kept
     n, _, h, w = live.shape
     order = tie.flatten(1).argsort(dim=1, stable=True)

@@ -8,6 +8,7 @@ from math import inf
 import torch
 from torch import Tensor
 
+from torchdls._tracing import has_values
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic.curl_tree import CurlTree
 from torchdls.operators import GradientOperator
@@ -87,7 +88,7 @@ class AlphaSurface(Integrator):
             misfit = (GradientOperator("forward", fields.steps)(z) - graph.v.detach()).abs()
             added = live & ~kept & (misfit <= limit)
             more = added.flatten(1).any(1)
-            if not bool(more.any()):
+            if not has_values(more) or not bool(more.any()):
                 break
             kept = kept | added
         return IntegrationResult(self._solve(fields, graph.v, graph.w * kept), count, ~more)
