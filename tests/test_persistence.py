@@ -126,7 +126,7 @@ def test_options_build_it_again(name: str, other: bool) -> None:
 def test_parts_are_named_dicts() -> None:
     model = DLS(learner=KSVD(n_nonzero=4), data_term=Huber(delta=0.1))
     options = model.options()
-    assert options["learner"] == {"name": "k_svd", "n_nonzero": 4, "steps": 1, "bound": math.inf}
+    assert options["learner"] == {"name": "k_svd", "n_nonzero": 4, "steps": 1, "bound": math.inf, "tol": 0.0}
     assert options["data_term"] == {"name": "huber", **Huber(delta=0.1).options()}
     short = torchdls.build("dls", learner={"name": "k_svd", "n_nonzero": 4}, data_term={"name": "huber", "delta": 0.1})
     assert short.options() == options

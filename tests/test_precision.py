@@ -38,6 +38,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "dct2": (torchdls.dct2, z),
     "dct2 by FFT": (torchdls.dct2, big),
     "denoise_normals": (lambda n: torchdls.denoise_normals(n).normals, n),
+    "denoise_height": (lambda z: torchdls.denoise_height(z, 0.5, patch_size=4, n_atoms=20, n_passes=1), z),
     "depth_to_points": (torchdls.depth_to_points, z.exp(), camera),
     "dlnv_normals": (lambda i, k: torchdls.dlnv_normals(i, k, patch_size=3, n_iter=1).normals, images, lights),
     "dlpi_normals": (lambda i, k: torchdls.dlpi_normals(i, k, patch_size=3, n_iter=1).normals, images, lights),
@@ -51,6 +52,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "height_to_points": (torchdls.height_to_points, z),
     "idct2": (torchdls.idct2, z),
     "idct2 by FFT": (torchdls.idct2, big),
+    "integrate_scattered": (torchdls.integrate_scattered, g[0, 0, :, :2], g[0, 1, :, :2], z[0, 0, :, :2]),
     "lights_from_ball": (lambda i: torchdls.lights_from_ball(i, torch.ones(6, 5, dtype=torch.bool)), images[0]),
     "log_depth_to_depth": (torchdls.log_depth_to_depth, z),
     "low_rank_normals": (lambda i, k: torchdls.low_rank_normals(i, k).normals, images, lights),
@@ -80,6 +82,8 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "DinoKat": (lambda p, d: torchdls.DinoKat()(p, d, B, 0.1)[2], P, D),
     "FixedDictionary": (lambda p, d: torchdls.FixedDictionary()(p, d, B, 0.1)[2], P, D),
     "SoupDIL": (lambda p, d: torchdls.SoupDIL()(p, d, B, 0.1)[2], P, D),
+    "Focuss": (lambda p, d: torchdls.Focuss()(p, d, B, 0.1)[2], P, D),
+    "BSpline.upsample": (lambda g: torchdls.BSpline().upsample(g, 2), g),
     "Unitary": (lambda p, d: torchdls.Unitary()(p, d, B[:, :9], 0.1)[2], P, D[..., :9]),
 }  # fmt: skip
 # What takes no tensor, gives no tensor, reads or draws a file, or is tested over its registry.

@@ -69,6 +69,11 @@ INTEGRATORS: Registry[Integrator] = Registry(
         "frankot_chellappa": "FrankotChellappa",
         "horn_brooks": "HornBrooks",
         "line_integral": "LineIntegral",
+        "shapelets": "Shapelets",
+        "alpha_surface": "AlphaSurface",
+        "b_spline": "BSpline",
+        "partial_integrability": "PartialIntegrability",
+        "spectral_path": "SpectralPath",
         "harker_oleary": "HarkerOLeary",
         "spectral_regularization": "SpectralRegularization",
         "tikhonov_regularization": "TikhonovRegularization",
@@ -93,6 +98,7 @@ LEARNERS: Registry[Learner] = Registry(
         "fixed": "FixedDictionary",
         "dino_kat": "DinoKat",
         "unitary": "Unitary",
+        "focuss": "Focuss",
     }
 )
 

@@ -8,7 +8,17 @@ import torch
 
 import torchdls
 from tests.helpers import DISK, assert_gradients, assert_unchanged, random_field, seeded
-from torchdls import DLS, KSVD, LEARNERS, SURFACES, DinoKat, FixedDictionary, SoupDIL, orthogonal_matching_pursuit
+from torchdls import (
+    DLS,
+    KSVD,
+    LEARNERS,
+    SURFACES,
+    DinoKat,
+    FixedDictionary,
+    Focuss,
+    SoupDIL,
+    orthogonal_matching_pursuit,
+)
 
 F64 = torch.float64
 
@@ -98,7 +108,7 @@ def test_pursuit_batches_and_derivatives():
 
 
 ALL = [SoupDIL(), SoupDIL("block", "keep"), KSVD(), KSVD(n_nonzero=3, steps=3), FixedDictionary(), DinoKat(),
-       DinoKat(2, (3, 4), "block")]  # fmt: skip
+       DinoKat(2, (3, 4), "block"), Focuss(), Focuss(1.0, 2)]  # fmt: skip
 
 
 @pytest.mark.parametrize("learner", ALL, ids=repr)
@@ -129,7 +139,7 @@ def test_no_pass_raises_the_cost(learner, shared):
         torch.testing.assert_close(alone[2], B[1:], atol=1e-8, rtol=1e-8)
 
 
-@pytest.mark.parametrize("learner", ALL[:5], ids=repr)
+@pytest.mark.parametrize("learner", [*ALL[:5], Focuss()], ids=repr)
 def test_learn_false_keeps_the_dictionary(learner):
     P, D = random_field(1, 9, 30), unit(random_field(1, 9, 12, seed=2))
     with assert_unchanged(D):
@@ -138,7 +148,7 @@ def test_learn_false_keeps_the_dictionary(learner):
     torch.testing.assert_close(R, P - D @ B)
 
 
-@pytest.mark.parametrize("learner", [SoupDIL(), KSVD(), KSVD(n_nonzero=2), DinoKat(), DinoKat(2)], ids=repr)
+@pytest.mark.parametrize("learner", [SoupDIL(), KSVD(), KSVD(n_nonzero=2), DinoKat(), DinoKat(2), Focuss()], ids=repr)
 def test_derivatives_of_a_pass(learner):
     P, D = random_field(1, 4, 6), low_rank_atoms(2, 2, 3, 2)[None]
 
@@ -175,6 +185,24 @@ def test_unused_atoms_of_ksvd_become_the_worst_patches():
     assert not B.any()
     worst = P[0][:, P[0].norm(dim=0).argsort(descending=True)[:4]]
     torch.testing.assert_close(D[0], unit(worst))
+
+
+def test_ksvd_to_a_residual():
+    """Codes are those of the pursuit; later passes meet the target with fewer atoms."""
+    P, D, tol = random_field(1, 9, 200), unit(random_field(1, 9, 14, seed=2)), 1.5
+    _, _, B = KSVD(tol=tol)(*start(P, D), 0.0, learn=False)
+    torch.testing.assert_close(B, orthogonal_matching_pursuit(P, D, tol=tol))
+    step, used = start(P, D), []
+    for _ in range(8):
+        R, D, B = step = KSVD(tol=tol)(*step, 0.0)
+        torch.testing.assert_close(R, P - D @ B)
+        used.append(int((B != 0).sum()))
+    assert used[-1] < 0.95 * used[0]
+    R, _, B = KSVD(tol=tol)(*step, 0.0, learn=False)
+    assert (R.square().sum(1) <= tol + 1e-9).all()
+    assert B.any(1).float().mean() > 0.5
+    with pytest.raises(ValueError, match="KSVD: tol=-1"):
+        KSVD(tol=-1.0)
 
 
 # ---- planted dictionaries

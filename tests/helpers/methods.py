@@ -67,6 +67,32 @@ METHODS: dict[str, Method] = {
         no={"functional_transforms_agree": "it stops when a value says so, in plain operations, which vmap refuses"},
         exact={"default": {"relaxation": 1.5}},
     ),
+    "shapelets": Method(no={"plane_is_exact": "a plane is not periodic"}),
+    "alpha_surface": Method(
+        {"n_iter": 10},
+        tol=1e-3,
+        no={
+            **ONE_SCALE,
+            "functional_transforms_agree": "edges are chosen by values, in plain operations, which vmap refuses",
+        },
+        exact={"default": {"n_iter": 3, "solve_tol": 1e-13}},
+    ),
+    "partial_integrability": Method(
+        tol=1e-3,
+        no={
+            **ONE_SCALE,
+            "functional_transforms_agree": "edges are chosen by values, in plain operations, which vmap refuses",
+        },
+        exact={"default": {"solve_tol": 1e-13}},
+    ),
+    "spectral_path": Method(
+        tol=1e-4,
+        no={
+            "scales_with_the_slopes": "bends depend on how steep the surface is",
+            "functional_transforms_agree": "the path is chosen by values, in plain operations, which vmap refuses",
+        },
+        exact={"default": {"solve_tol": 1e-13}},
+    ),
     "spectral_regularization": Method(no={"plane_is_exact": "a few cosines do not make a plane"}),
     "weighted_least_squares": Method(
         {"floor": 0.1}, tol=1e-4, no=ONE_SCALE, exact={"default": {"floor": 0.1, **TIGHT}}

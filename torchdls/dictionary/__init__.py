@@ -1,6 +1,8 @@
 """Dictionaries of patches: initial dictionaries, sparse coding, and the learners (SOUP-DIL first among them)."""
 
 from torchdls._registry import LEARNERS
+from torchdls.dictionary.denoise import denoise_height
+from torchdls.dictionary.focuss import Focuss
 from torchdls.dictionary.initial import dct_dictionary
 from torchdls.dictionary.learners import KSVD, DinoKat, FixedDictionary, Learner, SoupDIL
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
@@ -12,10 +14,12 @@ __all__ = [
     "LEARNERS",
     "DinoKat",
     "FixedDictionary",
+    "Focuss",
     "Learner",
     "SoupDIL",
     "Unitary",
     "dct_dictionary",
+    "denoise_height",
     "orthogonal_matching_pursuit",
     "soup_dil_sweep",
 ]

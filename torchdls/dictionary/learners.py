@@ -187,10 +187,16 @@ class KSVD:
     that no patch uses become the patches that are fitted worst. Not for `torch.compile` or `vmap`: the pursuit works on
     the patches that are not yet done.
 
+    With `tol`, a patch takes no more atoms than bring |p - D b|^2 down to it, and a residual below that counts as
+    `tol`: codes lower max(|p - D b|^2, tol) + mu^2 ||b||_0, of equal costs that of fewer atoms is kept, and atoms lower
+    the residual. The cost without `tol` may then rise. For patches of n pixels with noise of standard deviation s,
+    tol = n (1.15 s)^2 is usual; mu may then be 0.
+
     Args:
         n_nonzero: most atoms of a patch; None leaves it to mu.
         steps: alternating products per atom, at least 1.
         bound: bound a on the codes, for heights in pixels.
+        tol: squared residual of a patch that suffices, at least 0.
 
     Raises:
         ValueError: an option is out of range.
@@ -208,9 +214,12 @@ class KSVD:
     n_nonzero: int | None = None
     steps: int = 1
     bound: float = math.inf
+    tol: float = 0.0
 
     def __post_init__(self) -> None:
         check_options(self)
+        if not 0 <= self.tol < math.inf:
+            raise ValueError(f"KSVD: tol={self.tol!r} given, a number of at least 0 is needed")
 
     @full_precision
     def __call__(self, R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor, learn: bool = True) -> Step:
@@ -218,9 +227,10 @@ class KSVD:
         N, _, L = R.shape
         level = torch.as_tensor(mu, dtype=R.dtype, device=R.device).reshape(-1, 1).expand(N, L)
         P = R + D @ B
-        found = orthogonal_matching_pursuit(P, D, self.n_nonzero, mu=level).clamp(-self.bound, self.bound)
+        found = orthogonal_matching_pursuit(P, D, self.n_nonzero, mu=level, tol=self.tol)
+        found = found.clamp(-self.bound, self.bound)
         rest = P - D @ found
-        better = (_cost(rest, found, level) < _cost(R, B, level))[:, None]
+        better = self._is_better(rest, found, R, B, level)[:, None]
         R, B = torch.where(better, rest, R), torch.where(better, found, B)
         if not learn:
             return R, D, B
@@ -229,6 +239,12 @@ class KSVD:
         # One dictionary for all: the patches of the batch side by side are the patches of one surface.
         R, D, B = self._atoms(R.transpose(0, 1).flatten(1)[None], D, B.transpose(0, 1).flatten(1)[None])
         return R[0].unflatten(1, (N, L)).transpose(0, 1), D, B[0].unflatten(1, (N, L)).transpose(0, 1)
+
+    def _is_better(self, rest: Tensor, found: Tensor, R: Tensor, B: Tensor, level: Tensor) -> Tensor:
+        """(N, L) bool: the new codes of a patch cost less, or as much (its target is met) with fewer atoms."""
+        new, old = _cost(rest, found, level, self.tol), _cost(R, B, level, self.tol)
+        fewer = (found != 0).sum(1) < (B != 0).sum(1)
+        return (new < old) | ((new == old) & fewer)
 
     def _atoms(self, R: Tensor, D: Tensor, B: Tensor) -> Step:
         atoms, rows = [], []
@@ -263,9 +279,9 @@ def check_options(learner: Learner) -> None:
         raise ValueError(f"{name}: bound={options['bound']!r} given, a positive number is needed")
 
 
-def _cost(R: Tensor, B: Tensor, level: Tensor) -> Tensor:
-    """(N, L) cost of each patch."""
-    return R.square().sum(1) + level.square() * (B != 0).sum(1)
+def _cost(R: Tensor, B: Tensor, level: Tensor, tol: float) -> Tensor:
+    """(N, L) cost of each patch, whose residual need not be less than tol."""
+    return R.square().sum(1).clamp(min=tol) + level.square() * (B != 0).sum(1)
 
 
 def _unit(h: Tensor, instead: Tensor) -> Tensor:

@@ -3,13 +3,19 @@
 from torchdls._registry import INTEGRATORS
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic import (
+    AlphaSurface,
+    BSpline,
     FrankotChellappa,
     HarkerOLeary,
     HornBrooks,
     LeastSquares,
     LineIntegral,
+    PartialIntegrability,
+    Shapelets,
+    SpectralPath,
     SpectralRegularization,
     TikhonovRegularization,
+    integrate_scattered,
 )
 from torchdls.integrators.dls import DLS, DLSResult, Exact, Implicit, Proximal, Unroll, dls_objective
 from torchdls.integrators.piecewise import Piecewise, PiecewiseResult
@@ -27,6 +33,12 @@ from torchdls.integrators.robust import (
 from torchdls.integrators.slope_dls import SlopeDLS, SlopeDLSResult, shrink_slow_waves
 
 __all__ = [
+    "SpectralPath",
+    "integrate_scattered",
+    "PartialIntegrability",
+    "BSpline",
+    "AlphaSurface",
+    "Shapelets",
     "AnisotropicDiffusion",
     "Bilateral",
     "Huber",

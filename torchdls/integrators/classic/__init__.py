@@ -1,5 +1,7 @@
 """Classic integrators: one solve or one transform each."""
 
+from torchdls.integrators.classic.alpha_surface import AlphaSurface
+from torchdls.integrators.classic.b_spline import BSpline
 from torchdls.integrators.classic.fourier import FrankotChellappa
 from torchdls.integrators.classic.global_least_squares import (
     HarkerOLeary,
@@ -9,8 +11,18 @@ from torchdls.integrators.classic.global_least_squares import (
 from torchdls.integrators.classic.horn_brooks import HornBrooks
 from torchdls.integrators.classic.least_squares import LeastSquares
 from torchdls.integrators.classic.line_integral import LineIntegral
+from torchdls.integrators.classic.partial_integrability import PartialIntegrability
+from torchdls.integrators.classic.scattered import integrate_scattered
+from torchdls.integrators.classic.shapelets import Shapelets
+from torchdls.integrators.classic.spectral_path import SpectralPath
 
 __all__ = [
+    "SpectralPath",
+    "integrate_scattered",
+    "PartialIntegrability",
+    "BSpline",
+    "AlphaSurface",
+    "Shapelets",
     "FrankotChellappa",
     "HarkerOLeary",
     "HornBrooks",

@@ -64,11 +64,14 @@ class FrankotChellappa(Integrator):
         dx, dy = fields.steps
         wx = _frequencies(columns, columns // 2 + 1, like=gx) / dx
         wy = _frequencies(rows, rows, like=gx)[:, None] / dy
-        total = wx.square() + wy.square()
-        flat = total == 0
-        inverse = torch.where(flat, 0, 1 / torch.where(flat, 1, total))
-        spectrum = torch.fft.rfft2(gx) * (wx * inverse) + torch.fft.rfft2(gy) * (wy * inverse)
+        gain = self._gain(wx.square() + wy.square())
+        spectrum = torch.fft.rfft2(gx) * (wx * gain) + torch.fft.rfft2(gy) * (wy * gain)
         return torch.fft.irfft2(spectrum * -1j, s=(rows, columns))[..., :h, :w]
+
+    def _gain(self, total: Tensor) -> Tensor:
+        """The factor 1 / |w|^2 at each |w|^2, and 0 at 0."""
+        flat = total == 0
+        return torch.where(flat, 0, 1 / torch.where(flat, 1, total))
 
 
 def _mirror(g: Tensor, odd: int, even: int) -> Tensor:

@@ -115,8 +115,8 @@ class DLS(Iterative[DLSResult]):
         dictionary: initial dictionary (n, K), or (N, n, K) for each surface of a batch; atoms are brought to unit
             norm. An `nn.Parameter` is trained with the module, a tensor is a buffer. None for
             `dct_dictionary(patch_size, n_atoms)`.
-        learner: how codes and atoms are found: "soup_dil" (the paper's), "k_svd", "dino_kat", "unitary", "fixed", or a
-            `Learner` with options of its own, such as `SoupDIL(order="block", threshold="soft")` or
+        learner: how codes and atoms are found: "soup_dil" (the paper's), "k_svd", "dino_kat", "unitary", "focuss",
+            "fixed", or a `Learner` with options of its own, such as `SoupDIL(order="block", threshold="soft")` or
             `KSVD(n_nonzero=4)`. Its `threshold` and `bound` are those of the objective.
         learn: "each" learns a dictionary per surface, "shared" one for the batch, "fixed" updates the codes alone.
         height_step: "exact" solves for the height; "proximal" takes a proximal gradient step as in the paper; or
