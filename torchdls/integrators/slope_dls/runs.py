@@ -136,7 +136,7 @@ class Run:
         trust: Tensor | None = None,
     ) -> Coded:
         strips, totals, weights = places.down(slopes), [], []
-        for rows in places.strips(len(slopes)):
+        for rows in places.strips(slopes.shape[0]):
             coefficients = places.across(strips[..., rows, :])
             own = level[:, :, rows] if level.shape[2] > 1 else level
             limit = (own[..., None] * noise(rows)).detach()
