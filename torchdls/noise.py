@@ -7,13 +7,14 @@ import math
 import torch
 from torch import Tensor
 
-from torchdls._checks import check_field, check_fit
+from torchdls._checks import check_field, check_fit, check_numbers
 from torchdls._statistics import NORMAL_MEDIAN
 from torchdls._tracing import holds_everywhere
 from torchdls.operators import as_pixel_size, dst2, edge_slopes
 from torchdls.operators.cosine import cosine_matrix
 from torchdls.operators.sine import squared_sines
 from torchdls.operators.tables import table
+from torchdls.solvers.units import unit_of
 
 _CUT = 3.0  # samples beyond so many standard deviations belong to the surface (creases, waves), not to the noise
 _KEPT = math.erf(_CUT / math.sqrt(2))
@@ -81,20 +82,23 @@ def noise_level(
         0.1
     """
     dx, dy = as_pixel_size(pixel_size)
+    check_field("noise_level", "gradient", gradient, 2)
     single = gradient.ndim == 3
     if single:
         gradient = gradient[None]
         mask, weight = (None if t is None else t[None] for t in (mask, weight))
     _check(gradient, mask, weight)
     v, w = edge_slopes(gradient, mask, weight)
-    curl = _curl(v, dx, dy)
+    unit = unit_of(v.detach().abs().amax((1, 2, 3)))  # squares of slopes of order 1 are within any dtype
+    curl = _curl(v / unit[:, None, None, None], dx, dy)
     scale = math.hypot(dx, dy)
     if w is None:
         sigma = torch.minimum(_robust_scale(curl / scale), _spectral_scale(curl, dx, dy))
     else:
-        unit, cells = _normalised(curl, w, dx, dy)
-        local, spectral = _robust_scale(unit, cells), _spectral_scale(unit * scale, dx, dy)
+        even, cells = _normalised(curl, w, dx, dy)
+        local, spectral = _robust_scale(even, cells), _spectral_scale(even * scale, dx, dy)
         sigma = torch.where(_stationary(mask, weight), torch.minimum(local, spectral), local)
+    sigma = sigma * unit
     return sigma[0] if single else sigma
 
 
@@ -161,7 +165,6 @@ def _high_modes(h: int, w: int) -> Tensor:
 
 
 def _check(gradient: Tensor, mask: Tensor | None, weight: Tensor | None) -> None:
-    check_field("noise_level", "gradient", gradient, 2)
     if gradient.ndim != 4 or min(gradient.shape[2:]) < 2:
         shape = tuple(gradient.shape)
         raise ValueError(f"noise_level: gradient {shape} given, (N, 2, H, W) of at least 2 x 2 pixels is needed")
@@ -316,16 +319,15 @@ def noise_sigma(gradient: Tensor, snr_db: float, mask: Tensor | None = None) -> 
         >>> torchdls.noise_sigma(torch.ones(1, 2, 4, 4), snr_db=20)
         tensor([0.1000])
     """
-    if gradient.ndim not in (3, 4) or gradient.shape[-3] != 2:
-        raise ValueError(f"gradient: {tuple(gradient.shape)} given, (N, 2, H, W) or (2, H, W) is needed")
+    check_field("noise_sigma", "gradient", gradient, 2)
+    check_numbers("noise_sigma", snr_db=snr_db)
     if not math.isfinite(snr_db):
         raise ValueError(f"snr_db: {snr_db} given, a finite number of decibels is needed")
     square = gradient.square()
     if mask is None:
         power = square.mean((-3, -2, -1))
     else:
-        if mask.ndim != gradient.ndim or mask.shape[-2:] != gradient.shape[-2:]:
-            raise ValueError(f"mask {tuple(mask.shape)} does not fit the gradient {tuple(gradient.shape)}")
+        check_fit("noise_sigma", "mask", mask, gradient, "gradient", channels=(1,), dtype=torch.bool)
         inside = mask.expand_as(gradient)
         power = torch.where(inside, square, 0).sum((-3, -2, -1)) / inside.sum((-3, -2, -1))
     return power.sqrt() * 10 ** (-snr_db / 20)

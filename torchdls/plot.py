@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchdls._checks import check_real
 from torchdls._files import require
 from torchdls.geometry import gradient_to_normals
 from torchdls.metrics import describe
@@ -50,6 +51,7 @@ def hillshade(
         >>> shade.shape, round(float(shade[0, 0]), 2)
         (torch.Size([4, 5]), 0.5)
     """
+    check_real("hillshade", "height", height)
     if height.ndim < 2 or min(height.shape[-2:]) < 2:
         raise ValueError(f"height: shape {tuple(height.shape)} given, (..., H, W) of at least 2 x 2 pixels is needed")
     down, right = torch.gradient(height, dim=(-2, -1))

@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_field, check_whole
 from torchdls.noise import height_noise, noise_level
 from torchdls.operators import as_pixel_size, dct2, edge_slopes, idct2
 from torchdls.operators.tables import table
@@ -196,6 +197,8 @@ def select(
     """
     if criterion not in ("sure", "r2r"):
         raise ValueError(f"select: criterion={criterion!r} is unknown; choose from 'sure', 'r2r'")
+    check_field("select", "gradient", gradient, 2)
+    check_whole("select", candidates=candidates)
     if gradient.ndim != 4 or candidates < 1:
         raise ValueError(f"select: gradient {tuple(gradient.shape)} and candidates={candidates} given; "
                          "(N, 2, H, W) and at least one candidate are needed")  # fmt: skip

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_alike
+
 _CHUNK = 8192  # patches worked on at once: their rows of the Gram matrix are gathered
 
 
@@ -26,6 +28,7 @@ def orthogonal_matching_pursuit(
 
     Raises:
         ValueError: shapes do not fit, or `n_nonzero` is not an integer of at least 1.
+        TypeError: P and D are not tensors of one dtype, float32 or float64.
 
     Source: Pati, Rezaiifar, Krishnaprasad, "Orthogonal matching pursuit", 1993; Rubinstein, Zibulevsky, Elad,
     "Efficient implementation of the K-SVD algorithm using batch orthogonal matching pursuit", 2008.
@@ -35,7 +38,14 @@ def orthogonal_matching_pursuit(
         >>> torchdls.orthogonal_matching_pursuit(torch.tensor([[[0.1], [2.0], [1.0]]]), D, n_nonzero=1)[0, :, 0]
         tensor([0., 2., 0.])
     """
-    if P.ndim != 3 or D.ndim != 3 or D.shape[0] not in (1, P.shape[0]) or D.shape[1] != P.shape[1]:
+    check_alike("orthogonal_matching_pursuit", P=P, D=D)
+    if (
+        P.ndim != 3
+        or D.ndim != 3
+        or D.shape[0] not in (1, P.shape[0])
+        or D.shape[1] != P.shape[1]
+        or 0 in (*P.shape, *D.shape)
+    ):
         shapes = f"P {tuple(P.shape)} and D {tuple(D.shape)} do not fit"
         raise ValueError(f"orthogonal_matching_pursuit: {shapes}; (N, n, L) and (N or 1, n, K) are needed")
     if n_nonzero is not None and (not isinstance(n_nonzero, int) or n_nonzero < 1):

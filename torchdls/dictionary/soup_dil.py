@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls._checks import check_alike
 from torchdls._tracing import is_recorded
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold, shrink
 
@@ -68,6 +69,7 @@ def soup_dil_sweep(
 
     Raises:
         ValueError: shapes do not fit, an option is unknown, the bound is not positive, or a number mu is negative.
+        TypeError: P, D and B are not tensors of one dtype, float32 or float64.
 
     Source: Ravishankar, Nadakuditi, Fessler, "Efficient sum of outer products dictionary learning (SOUP-DIL)", 2015.
 
@@ -305,7 +307,8 @@ def _check(P: Tensor, D: Tensor, B: Tensor, order: str, unused: str, threshold: 
         raise ValueError(f"unused: {unused!r} is unknown; choose 'first' or 'keep'")
     if threshold not in THRESHOLDS:
         raise ValueError(f"threshold: {threshold!r} is unknown; choose from {', '.join(map(repr, THRESHOLDS))}")
-    fits = P.ndim == D.ndim == B.ndim == 3 and D.shape[0] in (1, P.shape[0])
+    check_alike("soup_dil_sweep", P=P, D=D, B=B)
+    fits = P.ndim == D.ndim == B.ndim == 3 and D.shape[0] in (1, P.shape[0]) and 0 not in (*P.shape, *D.shape)
     if not fits or D.shape[1] != P.shape[1] or B.shape != (P.shape[0], D.shape[2], P.shape[2]):
         raise ValueError(
             f"soup_dil_sweep: P {tuple(P.shape)}, D {tuple(D.shape)} and B {tuple(B.shape)} do not fit; "

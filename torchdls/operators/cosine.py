@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_real
 from torchdls.operators.tables import table
 
 # Up to this side two products with the cosine matrix beat the FFT and its reordering passes (measured on a CPU).
@@ -27,6 +28,10 @@ def dct2(x: Tensor) -> Tensor:
     Returns:
         (..., H, W), in the dtype and on the device of `x`.
 
+    Raises:
+        ValueError: x has no two dimensions, or none of some length.
+        TypeError: x is not float32 or float64.
+
     Source: Makhoul, "A fast cosine transform in one and two dimensions", IEEE TASSP 28(1), 1980.
 
     Example:
@@ -36,7 +41,7 @@ def dct2(x: Tensor) -> Tensor:
         >>> round(float(coefficients.norm()), 3)
         4.0
     """
-    h, w = x.shape[-2:]
+    h, w = _sides("dct2", x)
     if max(h, w) <= MATRIX_LIMIT:
         return cosine_matrix(h, like=x) @ x @ cosine_matrix(w, like=x).mT
     spectrum = torch.fft.rfft2(_reordered(x))
@@ -46,6 +51,13 @@ def dct2(x: Tensor) -> Tensor:
     return torch.cat([head, tail[..., 1 : (w + 1) // 2].flip(-1)], -1)
 
 
+def _sides(name: str, x: Tensor) -> tuple[int, int]:
+    check_real(name, "x", x)
+    if x.ndim < 2 or 0 in x.shape:
+        raise ValueError(f"{name}: x {tuple(x.shape)} given, (..., H, W) is needed")
+    return x.shape[-2], x.shape[-1]
+
+
 def idct2(x: Tensor) -> Tensor:
     """Inverse, and transpose, of `dct2`.
 
@@ -53,14 +65,14 @@ def idct2(x: Tensor) -> Tensor:
         x: (..., H, W) coefficients, float32 or float64.
 
     Returns:
-        (..., H, W), in the dtype and on the device of `x`.
+        (..., H, W), in the dtype and on the device of `x`. Raises as `dct2` does.
 
     Example:
         >>> x = torch.eye(5)
         >>> torch.allclose(torchdls.idct2(torchdls.dct2(x)), x, atol=1e-6)
         True
     """
-    h, w = x.shape[-2:]
+    h, w = _sides("idct2", x)
     if max(h, w) <= MATRIX_LIMIT:
         return cosine_matrix(h, like=x).mT @ x @ cosine_matrix(w, like=x)
     # The spectrum of the reordered image, from sums C without their scale, and C[H, .] = C[., W] = 0:

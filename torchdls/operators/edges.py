@@ -9,6 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls._checks import check_field, check_fit, require
+
 
 def edge_slopes(
     gradient: Tensor, mask: Tensor | None = None, weight: Tensor | None = None
@@ -32,6 +34,10 @@ def edge_slopes(
             v[:, 1, i, :] to the edge between rows i and i + 1 (0 in the last row).
         w: (N, 2, H, W) on the same edges, or None where every trust is 1.
 
+    Raises:
+        ValueError: a shape or device does not fit.
+        TypeError: a dtype does not.
+
     Example:
         >>> slopes, trust = torchdls.edge_slopes(torch.arange(3.0).expand(1, 2, 1, 3))
         >>> slopes[0, 0]  # half way between the pixels; no edge leaves the last column
@@ -39,8 +45,13 @@ def edge_slopes(
         >>> trust is None  # all are trusted alike
         True
     """
+    check_field("edge_slopes", "gradient", gradient, 2)
+    require(gradient.ndim == 4, f"edge_slopes: gradient {tuple(gradient.shape)} given, (N, 2, H, W) is needed")
     if mask is None and weight is None:
         return _pair_sums(gradient) * 0.5, None
+    for label, t, channels, dtype in (("mask", mask, (1,), torch.bool), ("weight", weight, (1, 2), None)):
+        if t is not None:
+            check_fit("edge_slopes", label, t, gradient, "gradient", channels=channels, dtype=dtype)
     trust = torch.ones_like(gradient) if weight is None else weight.expand_as(gradient)
     if mask is not None:
         gradient, trust = torch.where(mask, gradient, 0), torch.where(mask, trust, 0)

@@ -87,7 +87,9 @@ def render(
             f"snr_db={snr_db!r} None or finite"
         )
     n = normals if normals.ndim == 4 else normals[None]
-    lights = check_lights("render", lights, n, count=lights.shape[-2] if isinstance(lights, Tensor) else 0)
+    lights = check_lights(
+        "render", lights, n, count=lights.shape[-2] if isinstance(lights, Tensor) and lights.ndim > 1 else 0
+    )
     lambert = shading(n, lights)
     images = albedo * lambert.clamp(min=0)
     if highlight:
@@ -135,7 +137,9 @@ def cast_shadows(height: Tensor, lights: Tensor, pixel_size: float | Sequence[fl
     if height.ndim not in (3, 4) or height.shape[-3] != 1 or 0 in height.shape:
         raise ValueError(f"cast_shadows: height {tuple(height.shape)} given, (N, 1, H, W) or (1, H, W) is needed")
     z = (height if height.ndim == 4 else height[None]).detach()
-    lights = check_lights("cast_shadows", lights, z, count=lights.shape[-2] if isinstance(lights, Tensor) else 0)
+    lights = check_lights(
+        "cast_shadows", lights, z, count=lights.shape[-2] if isinstance(lights, Tensor) and lights.ndim > 1 else 0
+    )
     if bool((lights[..., 2] <= 0).any()):
         raise ValueError(f"cast_shadows: a light of {tuple(lights.shape)} is not above the horizon (z > 0)")
     steps = as_pixel_size(pixel_size)

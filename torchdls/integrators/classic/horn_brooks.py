@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers, check_whole
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.operators import GradientOperator, edge_slopes
 from torchdls.operators.edges import edge_ends
@@ -55,6 +56,8 @@ class HornBrooks(Integrator):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(pixel_size=pixel_size)
+        check_numbers("HornBrooks", tol=tol, relaxation=relaxation)
+        check_whole("HornBrooks", max_iter=max_iter)
         if not tol > 0 or not max_iter > 0:
             raise ValueError(f"HornBrooks: tol={tol!r} and max_iter={max_iter!r} given, both must be positive")
         if not 0 < relaxation < 2:

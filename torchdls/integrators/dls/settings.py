@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from torchdls._checks import check_numbers
 from torchdls._registry import LEARNERS
 from torchdls.dictionary.learners import DinoKat, Learner, SoupDIL
 from torchdls.dictionary.soup_dil import Order, Unused
@@ -36,6 +37,7 @@ def check_options(*, bound: float, tol: float, z_tol: float, grad_tol: float, **
     for name, least in _COUNTS.items():
         if not isinstance(options[name], int) or options[name] < least:
             raise ValueError(f"DLS: {name}={options[name]!r} given, an integer of at least {least} is needed")
+    check_numbers("DLS", bound=bound, tol=tol, z_tol=z_tol, grad_tol=grad_tol)
     if not bound > 0 or not tol >= 0 or not z_tol > 0 or not grad_tol > 0:
         positive = f"bound={bound!r}, z_tol={z_tol!r} and grad_tol={grad_tol!r} must be positive"
         raise ValueError(f"DLS: {positive}, tol={tol!r} not negative")

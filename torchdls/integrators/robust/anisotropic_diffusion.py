@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from torchdls._checks import check_numbers
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.robust.base import Robust, State
@@ -107,6 +108,7 @@ class AnisotropicDiffusion(Robust):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(n_iter=n_iter, tol=tol, solve_tol=solve_tol, pixel_size=pixel_size)
+        check_numbers("AnisotropicDiffusion", beta=beta)
         if not 0 < beta <= 1:
             raise ValueError(f"AnisotropicDiffusion: beta={beta!r} given, above 0 and at most 1 is needed")
         self.beta = beta

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.iterative import Callback, Iterative
@@ -66,6 +67,7 @@ class Robust(Iterative[RobustResult]):
         name = type(self).__name__
         if not isinstance(n_iter, int) or n_iter < 0:
             raise ValueError(f"{name}: n_iter={n_iter!r} given, an integer of at least 0 is needed")
+        check_numbers(name, tol=tol, solve_tol=solve_tol)
         if not tol >= 0 or not solve_tol > 0:
             raise ValueError(f"{name}: tol={tol!r} must be at least 0, solve_tol={solve_tol!r} positive")
         self.n_iter, self.tol, self.solve_tol = n_iter, tol, solve_tol

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple, cast
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers
 from torchdls._tracing import holds_everywhere
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
@@ -113,6 +114,7 @@ class _Linear(Convex):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(n_iter=n_iter, tol=tol, solve_tol=solve_tol, pixel_size=pixel_size)
+        check_numbers(type(self).__name__, smoothing=smoothing)
         if not 0 <= smoothing < float("inf"):
             raise ValueError(f"{type(self).__name__}: smoothing={smoothing!r} given, at least 0 is needed")
         self.smoothing = smoothing

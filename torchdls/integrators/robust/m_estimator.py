@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.robust.base import Robust, State
@@ -110,6 +111,7 @@ class MEstimator(Robust):
         super().__init__(n_iter=n_iter, tol=tol, solve_tol=solve_tol, pixel_size=pixel_size)
         if loss not in LOSSES:
             raise ValueError(f"MEstimator: loss={loss!r} is unknown; choose from {', '.join(map(repr, LOSSES))}")
+        check_numbers("MEstimator", floor=floor)
         if not 0 < floor < float("inf"):
             raise ValueError(f"MEstimator: floor={floor!r} given, a positive number is needed")
         self.loss, self.floor = loss, floor

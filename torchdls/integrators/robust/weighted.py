@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchdls._checks import check_numbers
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls.integrators.base import Fields
 from torchdls.integrators.classic.least_squares import LeastSquares
@@ -61,6 +62,7 @@ class WeightedLeastSquares(LeastSquares):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(tol=tol, max_iter=max_iter, pixel_size=pixel_size)
+        check_numbers("WeightedLeastSquares", threshold=threshold, floor=floor)
         if not 0 < threshold < float("inf") or not 0 < floor < float("inf"):
             raise ValueError(f"WeightedLeastSquares: threshold={threshold!r} and floor={floor!r} must be positive")
         self.threshold, self.floor = threshold, floor
