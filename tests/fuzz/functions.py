@@ -333,7 +333,8 @@ def learned(f: Any, given: Given, result: Any) -> None:
 
 def swept(f: Any, given: Given, result: Any) -> None:
     if given["threshold"] == "hard":
-        no_dearer(given["P"], given["D"], *result, given["mu"])
+        D, B = result
+        no_dearer(given["P"], given["D"], D, B, given["mu"])
 
 
 def pursuit_case(rng: random.Random) -> dict[str, str]:

@@ -1,16 +1,18 @@
-"""A bounded cache for the constant tables (cosines, eigenvalues) that the operators look up at every call."""
+"""A cache, bounded in bytes, for the constant tables (cosines, eigenvalues) that the operators look up at every call."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, wraps
+from functools import wraps
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchdls._caches import STORE
 
-def table(build: Callable[..., Tensor], maxsize: int = 64) -> Callable[..., Tensor]:
+
+def table(build: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """Cache a table that `build(*args)` computes on the CPU in float64, in the dtype and on the device of `like`.
 
     Tables are constants: they are built outside autograd and outside inference mode, so one table serves every caller.
@@ -24,11 +26,9 @@ def table(build: Callable[..., Tensor], maxsize: int = 64) -> Callable[..., Tens
                 dtype = dtype.to_complex() if values.is_complex() else values.dtype
             return values.to(dtype).to(device)
 
-    cached = lru_cache(maxsize)(make)
-
     @wraps(build)
     def lookup(*args: Any, like: Tensor) -> Tensor:
-        find = make if torch.compiler.is_compiling() else cached
-        return find(args, like.dtype, like.device)
+        key = args, like.dtype, like.device
+        return make(*key) if torch.compiler.is_compiling() else STORE.find((build, *key), lambda: make(*key))
 
     return lookup

@@ -138,7 +138,7 @@ def solve(
     problem = Problem(v, w, anchor, r, z0, setting.pixel_size)
     if v.dtype == torch.float64 or not bool(steep(w, setting).any()):
         return _finite(_in_general(problem, setting))
-    found = _in_general(Problem(*(None if t is None else t.double() for t in problem[:-1]), problem[-1]), setting)
+    found = _in_general(problem.double(), setting)
     return _finite(found._replace(height=found.height.to(v.dtype), residual=found.residual.to(v.dtype)))
 
 

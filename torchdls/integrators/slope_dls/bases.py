@@ -188,4 +188,4 @@ def _seen(n: int, size: int, offset: int, smooth: bool, double: Tensor) -> tuple
 
 
 _owners = table(_owners_build)
-_noise = table(_build_noise, maxsize=160)
+_noise = table(_build_noise)
