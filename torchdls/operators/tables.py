@@ -1,4 +1,4 @@
-"""A cache, bounded in bytes, for the constant tables (cosines, eigenvalues) that the operators look up at every call."""
+"""A cache, bounded in bytes, for the constant tables (cosines, eigenvalues) that operators look up at every call."""
 
 from __future__ import annotations
 

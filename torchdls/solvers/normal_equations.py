@@ -95,11 +95,12 @@ def directly(b: Tensor, w: Tensor, r: Tensor, x: Tensor, gauge: Gauge, setting: 
     rounded = solve(gauge.balance(_rounding(found.x, edges))).flatten(1).norm(dim=1)
     rounded = rounded / found.x.flatten(1).norm(dim=1).clamp(min=torch.finfo(b.dtype).tiny)
     lost = ~(rounded <= _ROUNDED)
-    residual = torch.where(lost, rounded, found.residual)
+    residual = torch.where(lost, rounded, found.residual).clamp(max=torch.finfo(dtype).max)
     return found._replace(x=found.x.to(dtype), residual=residual.to(dtype), converged=found.converged & ~lost)
 
 
 def _rounding(x: Tensor, edges: Tensor) -> Tensor:
-    """What rounding may have done to the pivots of H, as forces, with signs that do not cancel."""
-    sign = torch.arange(x[0].numel(), dtype=x.dtype, device=x.device).square().sin().sign().view(x[0].shape)
-    return torch.finfo(x.dtype).eps * edges * x.abs().amax((1, 2, 3), keepdim=True) * sign
+    """What rounding may have done to the pivots of H, as forces without a pattern, so that they do not cancel."""
+    k = torch.arange(1, x[0].numel() + 1, dtype=x.dtype, device=x.device)
+    size = 2 * torch.finfo(x.dtype).eps * x.abs().amax((1, 2, 3), keepdim=True)
+    return size * edges * k.square().sin().view(x[0].shape)

@@ -139,7 +139,11 @@ def solve(
     if v.dtype == torch.float64 or not bool(steep(w, setting).any()):
         return _finite(_in_general(problem, setting))
     found = _in_general(problem.double(), setting)
-    return _finite(found._replace(height=found.height.to(v.dtype), residual=found.residual.to(v.dtype)))
+    return _finite(
+        found._replace(
+            height=found.height.to(v.dtype), residual=found.residual.clamp(max=torch.finfo(v.dtype).max).to(v.dtype)
+        )
+    )
 
 
 def _finite(result: SolveResult) -> SolveResult:

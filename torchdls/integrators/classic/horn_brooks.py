@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchdls._checks import check_numbers, check_whole
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
+from torchdls.integrators.fields import in_units
 from torchdls.operators import GradientOperator, edge_slopes
 from torchdls.operators.edges import edge_ends
 from torchdls.solvers import ConvergenceWarning
@@ -70,6 +71,7 @@ class HornBrooks(Integrator):
 
     def told(self, fields: Fields) -> IntegrationResult:
         """The relaxation, and how many sweeps each surface took."""
+        fields, unit = in_units(fields)
         a = GradientOperator("forward", fields.steps)
         g = fields.gradient
         mask = torch.ones_like(g[:, :1], dtype=torch.bool) if fields.mask is None else fields.mask
@@ -102,4 +104,4 @@ class HornBrooks(Integrator):
         else:
             message = f"HornBrooks: {int(active.sum())} of {len(b)} surfaces above tol={self.tol:g}"
             warnings.warn(f"{message} after {self.max_iter} iterations", ConvergenceWarning, stacklevel=2)
-        return IntegrationResult(gauge.settle(z) + level, sweeps, ~active)
+        return IntegrationResult((gauge.settle(z) + level) * unit.slope, sweeps, ~active)

@@ -97,6 +97,8 @@ class AnisotropicDiffusion(Robust):
         [0.24, 0.1]
     """
 
+    _slopes = ("contrast",)
+
     def __init__(
         self,
         beta: float = 0.02,
@@ -128,7 +130,8 @@ class AnisotropicDiffusion(Robust):
                 (-3, -2, -1), keepdim=True
             ).clamp(min=1)
         else:
-            squared = g.new_full((1, 1, 1, 1), self.contrast**2)
+            most = torch.finfo(g.dtype).max ** 0.5 / 2
+            squared = g.new_full((1, 1, 1, 1), min(self.contrast, most) ** 2)
         q2 = (xx - yy).square() + 4 * xy.square()
         steep = q2 > (1e-2 * squared).square()  # below, the exponential is 0 to the last digit
         q = torch.where(steep, q2, 1).sqrt()

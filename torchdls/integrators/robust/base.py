@@ -12,6 +12,7 @@ from torch import Tensor
 from torchdls._checks import check_numbers
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
+from torchdls.integrators.fields import in_units
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.operators import edge_slopes
 from torchdls.solvers import solve
@@ -25,6 +26,7 @@ class RobustResult(NamedTuple):
     Attributes:
         height: (N, 1, H, W).
         objective: (N, iterations + 1), from the start on, for heights in pixels; constant once a surface has stopped.
+            Of slopes beyond 2^30 or below 2^-30 (float64: 250) it is that of the same slopes brought to order 1.
         iterations: (N,) the iterations each surface took.
         converged: (N,) bool, whether it met `tol` within them.
 
@@ -60,6 +62,9 @@ class Robust(Iterative[RobustResult]):
 
     quadratic = True
 
+    # Options that are slopes when they are numbers; with such a number, slopes are not brought to order 1.
+    _slopes: tuple[str, ...] = ()
+
     def __init__(
         self, *, n_iter: int, tol: float, solve_tol: float = 1e-6, pixel_size: float | Sequence[float] = 1.0
     ) -> None:
@@ -92,6 +97,8 @@ class Robust(Iterative[RobustResult]):
 
     def iterate(self, fields: Fields, callback: Callback | None = None) -> RobustResult:
         """The iterations, each surface until its objective settles."""
+        fields, unit = in_units(fields, all(isinstance(getattr(self, name), str) for name in self._slopes))
+        trust = unit.trust.flatten()
         data = self.data_term(fields)
         state = self._begin(fields, data)
         rounding = 10 * torch.finfo(state[0].dtype).eps * _objective(fields, data, torch.zeros_like(state[0])).detach()
@@ -104,13 +111,13 @@ class Robust(Iterative[RobustResult]):
             objective.append(choose(active, _objective(fields, data, state[0]), objective[-1]))
             iterations = iterations + active
             if callback is not None:
-                callback(iteration, objective[-1].detach())
+                callback(iteration, objective[-1].detach() * trust)
             if self.tol > 0:
                 change = (objective[-1] - objective[-2]).abs() + self._gap(data, state)
                 active = active & (change > self.tol * objective[-1] + rounding)
                 if not bool(active.any()):
                     break
-        return RobustResult(state[0], torch.stack(objective, 1), iterations, ~active)
+        return RobustResult(state[0] * unit.slope, torch.stack(objective, 1) * trust[:, None], iterations, ~active)
 
     def _begin(self, fields: Fields, data: DataTerm) -> State:
         """Where to start: the least-squares surface."""

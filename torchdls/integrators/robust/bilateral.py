@@ -79,6 +79,8 @@ class Bilateral(Robust):
         0.02
     """
 
+    _slopes = ("k",)
+
     def __init__(
         self,
         k: float = 2.0,

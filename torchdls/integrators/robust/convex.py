@@ -231,6 +231,8 @@ class Huber(Convex):
         [0.24, 0.02]
     """
 
+    _slopes = ("delta",)
+
     def __init__(
         self,
         delta: float | Literal["auto"] = "auto",

@@ -97,6 +97,8 @@ class MEstimator(Robust):
         [0.24, 0.1]
     """
 
+    _slopes = ("scale",)
+
     def __init__(
         self,
         loss: Literal["cauchy", "geman_mcclure", "tukey"] = "cauchy",

@@ -102,6 +102,8 @@ class MumfordShah(Robust):
         [0.24, 0.04]
     """
 
+    _slopes = ("kappa",)
+
     def __init__(
         self,
         kappa: float | Literal["auto"] = "auto",

@@ -12,6 +12,7 @@ from torchdls._checks import check_numbers
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls.integrators.base import Fields
 from torchdls.integrators.classic.least_squares import LeastSquares
+from torchdls.integrators.fields import in_units
 from torchdls.integrators.robust.residuals import curl_of, least_slope, present
 from torchdls.operators import edge_slopes
 from torchdls.solvers import SolveResult, solve
@@ -81,6 +82,7 @@ class WeightedLeastSquares(LeastSquares):
 
     def _trust(self, fields: Fields) -> Tensor:
         """(N, 2, H, W), q."""
+        fields, _ = in_units(fields)  # on which q does not depend
         g = fields.gradient
         valid = torch.ones_like(g, dtype=torch.bool) if fields.weight is None else (fields.weight > 0).expand_as(g)
         valid = valid if fields.mask is None else valid & fields.mask
