@@ -202,7 +202,9 @@ def outside(case: Case, f: Any, given: dict[str, Any], z: Tensor) -> None:
 
 
 def scaled(case: Case, f: Any, given: dict[str, Any], z: Tensor) -> None:
-    if not bool(given["gradient"].any()):  # whose scale is 1 by convention, whatever the anchors are
+    if not bool(
+        given["gradient"].flatten(1).any(1).all()
+    ):  # a field of zeros, whose scale is 1 by convention, whatever the anchors are
         return
     for factor in (-1.0, 2.0**20):
         changed = {k: t * factor if k in ("gradient", "anchor") else t for k, t in given.items()}

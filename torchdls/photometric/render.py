@@ -79,7 +79,7 @@ def render(
     if not isinstance(normals, Tensor) or normals.dtype not in (torch.float32, torch.float64):
         got = getattr(normals, "dtype", type(normals).__name__)
         raise TypeError(f"render: normals is {got}, a tensor of float32 or float64 is needed")
-    if normals.ndim not in (3, 4) or normals.shape[-3] != 3:
+    if normals.ndim not in (3, 4) or normals.shape[-3] != 3 or 0 in normals.shape:
         raise ValueError(f"render: normals {tuple(normals.shape)} given, (N, 3, H, W) or (3, H, W) is needed")
     if not highlight >= 0 or not shininess > 0 or (snr_db is not None and not math.isfinite(snr_db)):
         raise ValueError(
@@ -87,9 +87,11 @@ def render(
             f"snr_db={snr_db!r} None or finite"
         )
     n = normals if normals.ndim == 4 else normals[None]
-    lights = check_lights(
-        "render", lights, n, count=lights.shape[-2] if isinstance(lights, Tensor) and lights.ndim > 1 else 0
-    )
+    lights = check_lights("render", lights, n, count=_count(lights))
+    for label, field in (("albedo", albedo), ("shadow", shadow)):
+        sizes = field.shape[-2:] if isinstance(field, Tensor) else ()
+        if any(1 != own != side for own, side in zip(sizes[::-1], n.shape[:-3:-1], strict=False)):
+            raise ValueError(f"render: {label} {tuple(field.shape)} does not fit normals {tuple(normals.shape)}")
     lambert = shading(n, lights)
     images = albedo * lambert.clamp(min=0)
     if highlight:
@@ -137,15 +139,17 @@ def cast_shadows(height: Tensor, lights: Tensor, pixel_size: float | Sequence[fl
     if height.ndim not in (3, 4) or height.shape[-3] != 1 or 0 in height.shape:
         raise ValueError(f"cast_shadows: height {tuple(height.shape)} given, (N, 1, H, W) or (1, H, W) is needed")
     z = (height if height.ndim == 4 else height[None]).detach()
-    lights = check_lights(
-        "cast_shadows", lights, z, count=lights.shape[-2] if isinstance(lights, Tensor) and lights.ndim > 1 else 0
-    )
+    lights = check_lights("cast_shadows", lights, z, count=_count(lights))
     if bool((lights[..., 2] <= 0).any()):
         raise ValueError(f"cast_shadows: a light of {tuple(lights.shape)} is not above the horizon (z > 0)")
     steps = as_pixel_size(pixel_size)
     lights = lights.detach().expand(z.shape[0], -1, -1)
     rows = [torch.stack([_shadow(z[i, 0], light, steps) for light in lights[i]]) for i in range(len(z))]
     return torch.stack(rows) if height.ndim == 4 else rows[0]
+
+
+def _count(lights: Tensor) -> int:
+    return lights.shape[-2] if isinstance(lights, Tensor) and lights.ndim > 1 else 0
 
 
 def _shadow(z: Tensor, light: Tensor, pixel_size: tuple[float, float]) -> Tensor:

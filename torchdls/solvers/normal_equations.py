@@ -95,7 +95,7 @@ def directly(b: Tensor, w: Tensor, r: Tensor, x: Tensor, gauge: Gauge, setting: 
     rounded = solve(gauge.balance(_rounding(found.x, edges))).flatten(1).norm(dim=1)
     rounded = rounded / found.x.flatten(1).norm(dim=1).clamp(min=torch.finfo(b.dtype).tiny)
     lost = ~(rounded <= _ROUNDED)
-    residual = torch.where(lost, rounded, found.residual).clamp(max=torch.finfo(dtype).max)
+    residual = torch.where(lost, rounded, found.residual).nan_to_num(nan=torch.inf).clamp(max=torch.finfo(dtype).max)
     return found._replace(x=found.x.to(dtype), residual=residual.to(dtype), converged=found.converged & ~lost)
 
 
