@@ -65,7 +65,7 @@ def test_all_that_is_kept_stays_within_the_limit(monkeypatch):
 
 
 def test_the_limit_is_the_one_that_is_documented():
-    assert STORE.limit == LIMIT == 512 * 2**20
+    assert STORE.limit == LIMIT == 576 * 2**20
 
 
 def test_threads_may_ask_at_once():

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-LIMIT = 512 * 2**20  # bytes, of all that is kept; the tables of one size of 4096 x 4096 pixels in float32
+LIMIT = 576 * 2**20  # bytes of all that is kept: the tables of 4096 x 4096 pixels in float32 fit
 
 
 class Store:

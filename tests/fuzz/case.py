@@ -25,6 +25,7 @@ DOCUMENTED = (
     "holds no complete cell",  # noise_level
     "beyond",  # the height is beyond its dtype
     "no 2x2 cell",  # guess_convention
+    "size: ",  # DLS: that of its patches, which `Patches` refuses
     "no cell",
     "without any valid pixel",
 )

@@ -321,7 +321,7 @@ def truth(case: Case, f: Any, given: dict[str, Any], result: Any) -> None:
     size = max(offset, float(expected.abs().max()))
     edges = (w * present)[w * present > 0]
     apart = float(edges.max() / edges.min()) if len(edges) else 1.0
-    allowed = (1e-5 if apart < 1e12 else 1e-4) * relief + 8 * torch.finfo(v.dtype).eps * size
+    allowed = (1e-5 if apart < 1e9 else 1e-4) * relief + 8 * torch.finfo(v.dtype).eps * size
     converged = bool(result.converged.all())
     if converged and error > allowed:
         raise Flaw(f"off the exact solution by {error / relief:.1e} of the relief")

@@ -82,7 +82,8 @@ def solve(
 
     Where w is None and r is one number per surface, H is diagonal in the cosine basis and the solve is direct.
     Otherwise conjugate gradients run, preconditioned by such a direct solve; where weights jump by so many orders that
-    60 steps do not suffice, a direct factor by nested dissection takes over (up to 4 million pixels). On a connected
+    60 steps do not suffice, or they are more than 1e4 apart, a direct factor by nested dissection takes over (up to 4
+    million pixels; then `tol` is an error of heights, see docs/reliability.md). On a connected
     component (of the edges with w > 0) that no anchor holds, the height has zero mean; pixels with neither edge nor
     anchor are 0. No ridge is added.
 
