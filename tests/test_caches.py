@@ -18,7 +18,11 @@ def test_what_was_used_least_recently_goes_first():
     store, made = Store(3500), []
 
     def find(key):
-        return store.find(key, lambda: made.append(key) or kilobyte())
+        def make():
+            made.append(key)
+            return kilobyte()
+
+        return store.find(key, make)
 
     for key in "abc":
         assert find(key) is find(key)

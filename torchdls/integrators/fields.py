@@ -132,12 +132,13 @@ class Units(NamedTuple):
 def in_units(fields: Fields, slopes: bool = True) -> tuple[Fields, Units]:
     """The same fields with weights of order 1 and, if `slopes`, slopes whose fourth powers are within the dtype.
 
-    Nothing is rounded. Slopes that are so already stay as they are. Anchor weights beyond all that changes a height in
+    Nothing is rounded. What is so already, weights up to 1/16 and 16, stays as it is. Anchor weights beyond all that changes a height in
     the dtype act as that.
     """
     g, _, weight, anchor, r, _ = fields
     one = torch.ones_like(g[:, :1, :1, :1])
     trust = one if weight is None else unit_of(weight.detach().abs().amax((1, 2, 3), keepdim=True))
+    trust = torch.where((trust > 16) | (trust < 1 / 16), trust, 1)
     slope, tame, firm = one, *((2.0**250, 2.0**40) if g.dtype == torch.float64 else (2.0**30, 2.0**24))
     if slopes:
         unit = unit_of(g.detach().abs().amax((1, 2, 3), keepdim=True))

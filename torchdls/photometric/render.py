@@ -89,8 +89,9 @@ def render(
     n = normals if normals.ndim == 4 else normals[None]
     lights = check_lights("render", lights, n, count=_count(lights))
     for label, field in (("albedo", albedo), ("shadow", shadow)):
-        sizes = field.shape[-2:] if isinstance(field, Tensor) else ()
-        if any(1 != own != side for own, side in zip(sizes[::-1], n.shape[:-3:-1], strict=False)):
+        if isinstance(field, Tensor) and any(
+            1 != own != side for own, side in zip(field.shape[:-3:-1], n.shape[:-3:-1], strict=False)
+        ):
             raise ValueError(f"render: {label} {tuple(field.shape)} does not fit normals {tuple(normals.shape)}")
     lambert = shading(n, lights)
     images = albedo * lambert.clamp(min=0)

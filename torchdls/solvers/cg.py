@@ -70,7 +70,8 @@ def conjugate_gradients(
         r = r if project is None else project(r)  # a guess outside the range of H brings a residual that is too
         worse = _norm(r) > norm  # than no guess at all
         x, r = torch.where(_each(worse, b), 0, x), torch.where(_each(worse, b), b, r)
-    best, least = x.clone(), _norm(r)
+    best, least = x.clone(), _norm(r)  # a copy of the best iterate, but for a factor of ten
+    lowest = least
     active = least > goal
     iterations = torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
     p, rho, error = torch.zeros_like(b), torch.ones_like(goal), torch.zeros_like(goal)
@@ -94,11 +95,12 @@ def conjugate_gradients(
         iterations += active
         now = _norm(r)
         active = active & ~(now <= goal)  # NaN goes on, to end as not converged
+        lowest = torch.where(now < lowest, now, lowest)
         much = active & (now < 0.1 * least)  # a copy for each factor of ten costs little
         if bool(much.any()):
             best, least = torch.where(_each(much, x), x, best), torch.where(much, now, least)
     final = _norm(r)
-    lost = ~(final <= 10 * least) | ~(final <= norm)  # by rounding, or as the system is not what it should be: NaN too
+    lost = ~(final <= 10 * lowest) | ~(final <= norm)  # by rounding, or as the system is not what it should be: NaN too
     if bool(lost.any()):
         x = torch.where(_each(lost, x), best, x)
         final = torch.where(lost, least, final)
