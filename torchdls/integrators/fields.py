@@ -132,8 +132,8 @@ class Units(NamedTuple):
 def in_units(fields: Fields, slopes: bool = True) -> tuple[Fields, Units]:
     """The same fields with weights of order 1 and, if `slopes`, slopes whose fourth powers are within the dtype.
 
-    Nothing is rounded. What is so already, weights up to 1/16 and 16, stays as it is. Anchor weights beyond all that changes a height in
-    the dtype act as that.
+    Nothing is rounded. What is so already, weights up to 1/16 and 16, stays as it is. Anchor weights beyond all that
+    changes a height in the dtype act as that.
     """
     g, _, weight, anchor, r, _ = fields
     one = torch.ones_like(g[:, :1, :1, :1])

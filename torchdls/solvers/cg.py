@@ -95,7 +95,7 @@ def conjugate_gradients(
         iterations += active
         now = _norm(r)
         active = active & ~(now <= goal)  # NaN goes on, to end as not converged
-        lowest = torch.where(now < lowest, now, lowest)
+        lowest = torch.fmin(now, lowest)
         much = active & (now < 0.1 * least)  # a copy for each factor of ten costs little
         if bool(much.any()):
             best, least = torch.where(_each(much, x), x, best), torch.where(much, now, least)
