@@ -20,6 +20,8 @@ BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet $(addprefix --extra-index-url ,$(TORCH_INDEX)) $(TORCH)
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS)
 SCRATCH := build
+CASES ?= 20000
+SEED ?= 0
 
 # Benchmarks are pytest files (bench_*.py) and scripts that take --smoke, run as modules; common/ holds their helpers.
 BENCH_TESTS := $(wildcard benchmarks/speed/bench_*.py)
@@ -27,7 +29,7 @@ BENCH_SCRIPTS := $(filter-out $(BENCH_TESTS),$(wildcard benchmarks/speed/*.py be
 SMOKE_SIZES := not 512 and not 1024 and not 2048 and not 64-64
 NOTEBOOKS := $(patsubst notebooks/%.py,%,$(wildcard notebooks/*.py))
 
-.PHONY: help demo test test-slow docs lint format types notebooks notebooks-update picture bench-smoke check check-rest clean
+.PHONY: help demo test test-slow fuzz docs lint format types notebooks notebooks-update picture bench-smoke check check-rest clean
 .DELETE_ON_ERROR:
 
 help:
@@ -41,6 +43,9 @@ test: $(VENV)/.dev
 
 test-slow: $(VENV)/.dev
 	$(PYTEST) -m slow $(PYTEST_ARGS)
+
+fuzz: $(VENV)/.dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --cases $(CASES) --seed $(SEED)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

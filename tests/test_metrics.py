@@ -190,11 +190,13 @@ def test_float32_stays_float32(measure):
 def test_bad_input(measure):
     height, reference = pair(2)
     mask = holed_mask(2)
-    with pytest.raises(ValueError, match=r"height \(2, 1, 24, 31\) and reference \(2, 1, 24, 30\) differ in width"):
+    with pytest.raises(
+        ValueError, match=r"(height|depth) \(2, 1, 24, 31\) and reference \(2, 1, 24, 30\) differ in width"
+    ):
         measure(height, reference[..., 1:])
     with pytest.raises(ValueError, match=r"mask \(3, 1, 24, 31\)"):
         measure(height, reference, holed_mask(3))
-    with pytest.raises(ValueError, match=r"height \(24, 31\)"):
+    with pytest.raises(ValueError, match=r"(height|depth) \(24, 31\)"):
         measure(height[0, 0], reference[0, 0])
     with pytest.raises(TypeError, match=r"mask has dtype torch.float64"):
         measure(height, reference, mask.double())

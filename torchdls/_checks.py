@@ -5,6 +5,8 @@ A message restates the call: who complains, which argument, what came and what i
 
 from __future__ import annotations
 
+from numbers import Real
+
 import torch
 from torch import Tensor
 
@@ -15,6 +17,21 @@ def require(holds: bool, message: str) -> None:
     """ValueError with the message unless it holds."""
     if not holds:
         raise ValueError(message)
+
+
+def check_numbers(name: str, **options: object) -> None:
+    """Real numbers that are not NaN."""
+    for label, value in options.items():
+        if not isinstance(value, Real) or isinstance(value, bool):
+            raise TypeError(f"{name}: {label} is a {type(value).__name__}, a number is needed")
+        require(value == value, f"{name}: {label}={value!r} given, a number is needed")
+
+
+def check_whole(name: str, **options: object) -> None:
+    """Integers."""
+    for label, value in options.items():
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise TypeError(f"{name}: {label} is a {type(value).__name__}, an integer is needed")
 
 
 def check_real(name: str, label: str, field: Tensor) -> None:
@@ -37,6 +54,20 @@ def check_dtype(name: str, dtype: torch.dtype) -> None:
     """float32 or float64, asked for of a result."""
     if dtype not in REAL:
         raise TypeError(f"{name}: dtype is {dtype}; torch.float32 or torch.float64 is needed")
+
+
+def check_together(name: str, **fields: object) -> None:
+    """Tensors of float32 or float64, all of one dtype and on one device."""
+    first: tuple[str, Tensor] | None = None
+    for label, field in fields.items():
+        if not isinstance(field, Tensor):
+            raise TypeError(f"{name}: {label} is a {type(field).__name__}, a tensor is needed")
+        check_real(name, label, field)
+        first = (label, field) if first is None else first
+        if field.dtype != first[1].dtype:
+            raise TypeError(f"{name}: {label} has dtype {field.dtype}, that of {first[0]}, {first[1].dtype}, is needed")
+        if field.device != first[1].device:
+            raise ValueError(f"{name}: {label} is on {field.device}, {first[0]} on {first[1].device}")
 
 
 def check_field(name: str, label: str, field: Tensor, channels: int) -> None:

@@ -184,7 +184,7 @@ def mean_absolute_depth_error(depth: Tensor, reference: Tensor, mask: Tensor | N
         >>> torchdls.mean_absolute_depth_error(depth, torch.tensor([[[2.0, 4.0, 6.0]]]))
         tensor(0.3333)
     """
-    depth, reference, mask = _fields("mean_absolute_depth_error", depth, reference, mask)
+    depth, reference, mask = _fields("mean_absolute_depth_error", depth, reference, mask, label="depth")
     depth, reference = torch.where(mask, depth, 1), torch.where(mask, reference, 0)
     ratio = (reference / depth).flatten(-3)
     scale = midpoint_median(ratio, mask.flatten(-3) & ~ratio.isnan())
@@ -192,16 +192,21 @@ def mean_absolute_depth_error(depth: Tensor, reference: Tensor, mask: Tensor | N
 
 
 def _fields(
-    name: str, height: Tensor, reference: Tensor, mask: Tensor | None, channels: tuple[int, ...] = (1,)
+    name: str,
+    height: Tensor,
+    reference: Tensor,
+    mask: Tensor | None,
+    channels: tuple[int, ...] = (1,),
+    label: str = "height",
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The checked fields, with a reference and a mask of batch size 1 expanded, and a mask in any case."""
-    check_field(name, "height", height, 1)
-    check_fit(name, "reference", reference, height, "height", channels=channels)
+    check_field(name, label, height, 1)
+    check_fit(name, "reference", reference, height, label, channels=channels)
     shape = tuple(height.shape)
     reference = reference.expand(*shape[:-3], -1, -1, -1)
     if mask is None:
         return height, reference, torch.ones_like(height, dtype=torch.bool)
-    check_fit(name, "mask", mask, height, "height", channels=(1,), dtype=torch.bool)
+    check_fit(name, "mask", mask, height, label, channels=(1,), dtype=torch.bool)
     if not mask.flatten(-3).any(-1).all():
         raise ValueError(f"{name}: mask {tuple(mask.shape)} holds a surface without any valid pixel")
     return height, reference, mask.expand(shape)

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchdls._checks import check_field, check_fit, require
+from torchdls._checks import check_field, check_fit, check_numbers, require
 from torchdls._precision import full_precision
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls._tracing import holds_everywhere
@@ -16,6 +16,7 @@ from torchdls.operators.cosine import cosine_matrix
 from torchdls.operators.edges import cell_curl, cell_edges, complete_cells, mean_trust
 from torchdls.operators.sine import squared_sines
 from torchdls.operators.tables import table
+from torchdls.solvers.units import unit_of
 
 _CUT = 3.0  # samples beyond so many standard deviations belong to the surface (creases, waves), not to the noise
 _KEPT = math.erf(_CUT / math.sqrt(2))
@@ -107,15 +108,16 @@ def noise_if_told(
     if min(gradient.shape[-2:]) < 2:
         return gradient.new_zeros(n), torch.zeros(n, dtype=torch.bool, device=gradient.device)
     v, w = edge_slopes(gradient, mask)
-    curl = cell_curl(v, (dx, dy))
+    unit = unit_of(v.detach().abs().amax((1, 2, 3)))  # squares of slopes of order 1 are within any dtype
+    curl = cell_curl(v / unit[:, None, None, None], (dx, dy))
     scale = math.hypot(dx, dy)
     if w is None and weight is None:
         sigma = torch.minimum(_robust_scale(curl / scale), _spectral_scale(curl, dx, dy))
-        return sigma, torch.ones(n, dtype=torch.bool, device=gradient.device)
-    unit, cells = _normalised(curl, _trusts(gradient, mask, weight), dx, dy)
-    local, spectral = _robust_scale(unit, cells), _spectral_scale(unit * scale, dx, dy)
+        return sigma * unit, torch.ones(n, dtype=torch.bool, device=gradient.device)
+    even, cells = _normalised(curl, _trusts(gradient, mask, weight), dx, dy)
+    local, spectral = _robust_scale(even, cells), _spectral_scale(even * scale, dx, dy)
     sigma = torch.where(_stationary(mask, weight), torch.minimum(local, spectral), local)
-    return sigma, cells.flatten(1).any(1)
+    return sigma * unit, cells.flatten(1).any(1)
 
 
 def _trusts(gradient: Tensor, mask: Tensor | None, weight: Tensor | None) -> Tensor:
@@ -400,6 +402,7 @@ def noise_sigma(gradient: Tensor, snr_db: float, mask: Tensor | None = None) -> 
         tensor([0.1000])
     """
     check_field("noise_sigma", "gradient", gradient, 2)
+    check_numbers("noise_sigma", snr_db=snr_db)
     if not math.isfinite(snr_db):
         raise ValueError(f"snr_db: {snr_db} given, a finite number of decibels is needed")
     square = gradient.square()

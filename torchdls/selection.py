@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchdls._checks import check_alike, check_field, require
+from torchdls._checks import check_alike, check_field, check_whole, require
 from torchdls._precision import full_precision
 from torchdls.noise import height_noise, noise_level
 from torchdls.operators import as_pixel_size, dct2, edge_slopes, idct2
@@ -215,6 +215,7 @@ def select(
     if noise is not None:
         check_alike("select", "noise", noise, gradient.dtype)
         require(noise.shape == gradient.shape[:1], f"select: noise {tuple(noise.shape)} given, (N,) is needed")
+    check_whole("select", candidates=candidates)
     if gradient.ndim != 4 or candidates < 1:
         raise ValueError(f"select: gradient {tuple(gradient.shape)} and candidates={candidates} given; "
                          "(N, 2, H, W) and at least one candidate are needed")  # fmt: skip

@@ -90,7 +90,9 @@ def test_an_iteration_of_the_masked_solve():
     more = steps[1] - steps[0]
     assert more >= 3
     assert counts[1].count["_fft_r2c"] - counts[0].count["_fft_r2c"] == more
-    assert counts[1].count.total() - counts[0].count.total() <= 54 * more
+    assert (
+        counts[1].count.total() - counts[0].count.total() <= 64 * more
+    )  # eight of them on one number per surface: which iterate is the best
     assert counts[1].large.total() - counts[0].large.total() < 30 * more
 
 

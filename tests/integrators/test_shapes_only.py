@@ -22,7 +22,9 @@ def fixed(name, **more):
     return method(name).build(name, **{**steps, **more})
 
 
-FORMS: list[tuple[str, dict[str, Any]]] = [(name, {}) for name in INTEGRATORS if name != "piecewise"]  # its steps follow values
+FORMS: list[tuple[str, dict[str, Any]]] = [
+    (name, {}) for name in INTEGRATORS if name != "piecewise"
+]  # its steps follow values
 FORMS += [
     ("dls", {"learner": "fixed"}),
     ("dls", {"select": True, "mu": "auto"}),

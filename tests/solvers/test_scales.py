@@ -1,11 +1,14 @@
 """The solve (*) at every scale of slopes, weights, anchors and pixels, against closed forms and SciPy."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
 
+from tests.fuzz.values import rational_solve
 from tests.helpers import MASKS, random_field, seeded, sparse_solve
-from torchdls import INTEGRATORS, LeastSquares, edge_slopes, solve
+from torchdls import INTEGRATORS, ConvergenceWarning, LeastSquares, edge_slopes, solve
 from torchdls.solvers import conjugate_gradients
 
 DTYPES = [torch.float64, torch.float32]
@@ -208,3 +211,55 @@ def test_conjugate_gradients_never_end_worse_than_they_began():
         found = conjugate_gradients(lambda x: x @ A, lambda x: x.clone(), b, x0, tol=1e-8, max_iter=1)
         assert float((b - found.x @ A).norm()) <= float(b.norm()) * (1 + 1e-12)
         assert not bool(found.converged.any())
+
+
+def far_apart(orders, seed, dtype):
+    """Noise on 3 x 4 pixels, with weights so many orders apart, and the exact solution."""
+    u = torch.rand(1, 2, 3, 4, dtype=torch.float64, generator=seeded(seed))
+    v, w = random_field(1, 2, 3, 4, seed=seed + 100).to(dtype), (10 ** (orders * (u - 0.5))).to(dtype)
+    w[:, 0, :, -1] = w[:, 1, -1] = 0
+    return v, w, rational_solve(v[0], w[0], None, None)[None]
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("orders", [3, 6, 9])
+def test_weights_of_edges_far_apart(orders, dtype):
+    """The tolerance of the firm edges used to swallow the slopes on weak ones: a third of the relief was missing."""
+    for seed in range(10):
+        v, w, exact = far_apart(orders, seed, dtype)
+        found = solve(v, w)
+        assert bool(found.converged.all())
+        assert error(found.height, exact) < 1e-5
+        spoilt = w.clone()
+        spoilt[:, 0, :, -1] = spoilt[:, 1, -1] = 1e20  # edges that are not there
+        assert torch.equal(solve(v, spoilt).height, found.height)
+
+
+def test_weights_beyond_what_rounding_leaves_warn():
+    seen = 0
+    for seed in range(10):
+        v, w, exact = far_apart(24, seed, torch.float64)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            found = solve(v, w)
+        assert bool(found.converged.all()) != bool(told)
+        assert not told or issubclass(told[0].category, ConvergenceWarning)
+        seen += bool(told)
+        if not told:
+            assert error(found.height, exact) < 1e-4
+    assert seen > 3
+
+
+def test_conjugate_gradients_return_about_the_best_iterate():
+    """On an ill-conditioned system residuals swing by orders: where the limit falls must not matter."""
+    scale = torch.logspace(0, 4, 40, dtype=torch.float64)
+    turn = torch.linalg.qr(random_field(40, 40))[0]
+    A = turn @ torch.diag(scale) @ turn.mT
+    b = random_field(1, 40, seed=1) @ A
+    least, swing = float(b.norm()), 1.0
+    for limit in range(1, 80):
+        found = conjugate_gradients(lambda x: x @ A, lambda x: x.clone(), b, None, tol=1e-14, max_iter=limit)
+        residual = float(found.residual * b.norm())
+        least = min(least, residual)
+        swing = max(swing, residual / least)
+    assert 1 < swing <= 10

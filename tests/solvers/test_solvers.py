@@ -348,7 +348,7 @@ def test_weights_that_jump_by_many_orders_are_solved_exactly(generator):
     v = torch.randn(1, 2, n, n, generator=generator, dtype=torch.float64)
     found = solve(v, w, tol=1e-9)
     assert bool(found.converged.all())
-    assert 60 < int(found.iterations) <= 63  # the patience, and at most three steps with the factor
+    assert int(found.iterations) <= 3  # with the factor
     assert_solves(found.height, v, w, atol=1e-6)
 
 

@@ -35,6 +35,7 @@ def orthogonal_matching_pursuit(
     Raises:
         TypeError: P is not float32 or float64, D of another dtype, or a tensor `mu` or `tol` not of floats.
         ValueError: shapes do not fit, or `n_nonzero` is not an integer of at least 1.
+        TypeError: P and D are not tensors of one dtype, float32 or float64.
 
     Source: Pati, Rezaiifar, Krishnaprasad, "Orthogonal matching pursuit", 1993; Rubinstein, Zibulevsky, Elad,
     "Efficient implementation of the K-SVD algorithm using batch orthogonal matching pursuit", 2008.
@@ -46,7 +47,13 @@ def orthogonal_matching_pursuit(
     """
     check_real("orthogonal_matching_pursuit", "P", P)
     check_alike("orthogonal_matching_pursuit", "D", D, P.dtype)
-    if P.ndim != 3 or D.ndim != 3 or D.shape[0] not in (1, P.shape[0]) or D.shape[1] != P.shape[1]:
+    if (
+        P.ndim != 3
+        or D.ndim != 3
+        or D.shape[0] not in (1, P.shape[0])
+        or D.shape[1] != P.shape[1]
+        or 0 in (*P.shape, *D.shape)
+    ):
         shapes = f"P {tuple(P.shape)} and D {tuple(D.shape)} do not fit"
         raise ValueError(f"orthogonal_matching_pursuit: {shapes}; (N, n, L) and (N or 1, n, K) are needed")
     if n_nonzero is not None and (not isinstance(n_nonzero, int) or n_nonzero < 1):

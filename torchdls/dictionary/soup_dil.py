@@ -72,6 +72,7 @@ def soup_dil_sweep(
     Raises:
         TypeError: P is not float32 or float64, D or B of another dtype, or a tensor mu not of floats.
         ValueError: shapes do not fit, an option is unknown, the bound is not positive, or a number mu is negative.
+        TypeError: P, D and B are not tensors of one dtype, float32 or float64.
 
     Source: Ravishankar, Nadakuditi, Fessler, "Efficient sum of outer products dictionary learning (SOUP-DIL)", 2015.
 
@@ -315,7 +316,7 @@ def _check(P: Tensor, D: Tensor, B: Tensor, order: str, unused: str, threshold: 
     check_real("soup_dil_sweep", "P", P)
     check_alike("soup_dil_sweep", "D", D, P.dtype)
     check_alike("soup_dil_sweep", "B", B, P.dtype)
-    fits = P.ndim == D.ndim == B.ndim == 3 and D.shape[0] in (1, P.shape[0])
+    fits = P.ndim == D.ndim == B.ndim == 3 and D.shape[0] in (1, P.shape[0]) and 0 not in (*P.shape, *D.shape)
     if not fits or D.shape[1] != P.shape[1] or B.shape != (P.shape[0], D.shape[2], P.shape[2]):
         raise ValueError(
             f"soup_dil_sweep: P {tuple(P.shape)}, D {tuple(D.shape)} and B {tuple(B.shape)} do not fit; "

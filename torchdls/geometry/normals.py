@@ -168,6 +168,7 @@ def gradient_to_normals(
         covector = torch.cat([-gx, -gy, one + gx * columns + gy * rows], -3)
         k = check_camera(camera, gradient)
         n = permute(-apply_matrix(k.mT, covector), NORMAL_CONVENTIONS["opencv"])
+    n = n / n.detach().abs().amax(-3, keepdim=True)  # of order 1: the square of a slope of 1e20 is beyond float32
     return permute(n / torch.linalg.vector_norm(n, dim=-3, keepdim=True), inverse_axes(axes))
 
 

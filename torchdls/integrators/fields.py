@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchdls._checks import check_fit, require
 from torchdls._tracing import all_finite, holds_everywhere
+from torchdls.solvers.units import unit_of
 
 
 class Fields(NamedTuple):
@@ -119,3 +120,35 @@ def has_even_trust(fields: Fields, weight: Tensor | None = None) -> Tensor:
 def largest_per_surface(x: Tensor) -> Tensor:
     """(N, 1, 1, 1), the largest value of each surface."""
     return x.flatten(1).amax(1)[:, None, None, None]
+
+
+class Units(NamedTuple):
+    """Of slopes (and heights) and of weights, powers of two (N, 1, 1, 1)."""
+
+    slope: Tensor
+    trust: Tensor
+
+
+def in_units(fields: Fields, slopes: bool = True) -> tuple[Fields, Units]:
+    """The same fields with weights of order 1 and, if `slopes`, slopes whose fourth powers are within the dtype.
+
+    Nothing is rounded. What is so already, weights up to 1/16 and 16, stays as it is. Anchor weights beyond all that
+    changes a height in the dtype act as that.
+    """
+    g, _, weight, anchor, r, _ = fields
+    one = torch.ones_like(g[:, :1, :1, :1])
+    trust = one if weight is None else unit_of(weight.detach().abs().amax((1, 2, 3), keepdim=True))
+    trust = torch.where((trust > 16) | (trust < 1 / 16), trust, 1)
+    slope, tame, firm = one, *((2.0**250, 2.0**40) if g.dtype == torch.float64 else (2.0**30, 2.0**24))
+    if slopes:
+        unit = unit_of(g.detach().abs().amax((1, 2, 3), keepdim=True))
+        slope = torch.where((unit > tame) | (unit < 1 / tame), unit, 1)
+    if r is not None:
+        least = torch.finfo(r.dtype).tiny  # a weight that is not 0 stays so
+        r = torch.where(r > 0, (r / trust).clamp(least, firm), 0)
+    return fields._replace(
+        gradient=g / slope,
+        weight=None if weight is None else weight / trust,
+        anchor=None if anchor is None else anchor / slope,
+        anchor_weight=r,
+    ), Units(slope, trust)

@@ -62,7 +62,7 @@ def idct2(x: Tensor) -> Tensor:
         x: (..., H, W) coefficients, float32 or float64.
 
     Returns:
-        (..., H, W), in the dtype and on the device of `x`.
+        (..., H, W), in the dtype and on the device of `x`. Raises as `dct2` does.
 
     Raises:
         TypeError: as `dct2`.

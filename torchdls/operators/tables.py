@@ -1,19 +1,20 @@
-"""A bounded cache for the constant tables (cosines, eigenvalues) that the operators look up at every call."""
+"""A cache, bounded in bytes, for the constant tables (cosines, eigenvalues) that operators look up at every call."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, wraps
+from functools import wraps
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import _disable_current_modes
 
+from torchdls._caches import STORE
 from torchdls._tracing import is_fake
 
 
-def table(build: Callable[..., Tensor], maxsize: int = 64) -> Callable[..., Tensor]:
+def table(build: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """Cache a table that `build(*args)` computes on the CPU in float64, in the dtype and on the device of `like`.
 
     Tables are constants: they are built outside autograd and outside inference mode, so one table serves every caller.
@@ -29,16 +30,20 @@ def table(build: Callable[..., Tensor], maxsize: int = 64) -> Callable[..., Tens
                 dtype = values.dtype
             return values.to(dtype).to(device)
 
-    cached = lru_cache(maxsize)(make)
-
     @wraps(build)
     def lookup(*args: Any, like: Tensor) -> Tensor:
+        key = args, like.dtype, like.device
+
+        def kept() -> Tensor:
+            found: Tensor = STORE.find((build, *key), lambda: make(*key))
+            return found
+
         if torch.compiler.is_dynamo_compiling() or _symbolic(args):
-            return make(args, like.dtype, like.device)
+            return make(*key)
         if torch.compiler.is_compiling():  # `torch.export` takes a tensor from outside of its graph for a constant
             with _disable_current_modes():
-                return cached(args, like.dtype, like.device)
-        return make(args, like.dtype, like.device) if is_fake(like) else cached(args, like.dtype, like.device)
+                return kept()
+        return make(*key) if is_fake(like) else kept()
 
     return lookup
 

@@ -156,6 +156,10 @@ def cast_shadows(height: Tensor, lights: Tensor, pixel_size: float | Sequence[fl
     return torch.stack(rows) if height.ndim == 4 else rows[0]
 
 
+def _count(lights: Tensor) -> int:
+    return lights.shape[-2] if isinstance(lights, Tensor) and lights.ndim > 1 else 0
+
+
 def _shadow(z: Tensor, light: Tensor, pixel_size: tuple[float, float]) -> Tensor:
     """(H, W) bool of one surface and one light."""
     h, w = z.shape

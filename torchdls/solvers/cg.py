@@ -36,6 +36,7 @@ def conjugate_gradients(
     project: LinearMap | None = None,
     deflate: LinearMap | None = None,
     scale: Tensor | None = None,
+    by_steps: bool = False,
 ) -> CGResult:
     """Solve H x = b for every system of the batch.
 
@@ -52,31 +53,37 @@ def conjugate_gradients(
         deflate: oblique projection v -> v - H e (e^T v) / (e^T H e) along directions e that the caller solves for; b
             must have no part along them, and x is right up to them.
         scale: (N,) what residuals are measured by; None for ||b||.
+        by_steps: where `precondition` is nearly the inverse, P r is nearly the error of x: a system stops once
+            ||P r|| <= tol ||x||, which is what comes back as its residual.
 
-    A system that has stopped is frozen: its result does not depend on its neighbours in the batch. None ends worse than
-    where it started, nor than from 0.
+    A system that has stopped is frozen: its result does not depend on its neighbours in the batch. None ends at a
+    residual above ten times the smallest that it has seen, nor above that of 0.
     """
     norm = _norm(b)
     scale = norm if scale is None else scale
-    goal = tol * scale
+    goal = 0 * scale if by_steps else tol * scale
     if x0 is None:
         x, r = torch.zeros_like(b), b.clone()
     else:  # where b = 0 the solution is 0, which no iteration from elsewhere would meet
-        x = torch.where(norm.view(-1, *[1] * (b.ndim - 1)) > 0, x0, 0)
+        x = torch.where(_each(norm, b) > 0, x0, 0)
         r = b - apply(x)
         r = r if project is None else project(r)  # a guess outside the range of H brings a residual that is too
         worse = _norm(r) > norm  # than no guess at all
-        x, r = (
-            torch.where(worse.view(-1, *[1] * (b.ndim - 1)), t, own) for t, own in ((torch.zeros_like(b), x), (b, r))
-        )
-    began, before = (x.clone(), _norm(r)) if x0 is not None else (None, _norm(r))
-    active = before > goal
+        x, r = torch.where(_each(worse, b), 0, x), torch.where(_each(worse, b), b, r)
+    best, least = x.clone(), _norm(r)  # a copy of the best iterate, but for a factor of ten
+    lowest = least
+    active = least > goal
     iterations = torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
-    p, rho = torch.zeros_like(b), torch.ones_like(goal)
+    p, rho, error = torch.zeros_like(b), torch.ones_like(goal), torch.zeros_like(goal)
     for _ in range(max_iter):
         if not bool(active.any()):
             break
         y = precondition(r)
+        if by_steps:
+            error = torch.where(active, _norm(y) / torch.where(_norm(x) > 0, _norm(x), 1), error)
+            active = active & ~((error <= tol) & (iterations > 0))
+            if not bool(active.any()):
+                break
         rho_new = _dot(r, y)
         p.mul_(_ratio(rho_new, rho, iterations > 0, p)).add_(y)  # in place: new memory costs as much as the arithmetic
         q = apply(p) if deflate is None else deflate(apply(p))
@@ -86,15 +93,24 @@ def conjugate_gradients(
         r = r if project is None else project(r)
         rho = rho_new
         iterations += active
-        active = active & (_norm(r) > goal)
+        now = _norm(r)
+        active = active & ~(now <= goal)  # NaN goes on, to end as not converged
+        lowest = torch.fmin(now, lowest)
+        much = active & (now < 0.1 * least)  # a copy for each factor of ten costs little
+        if bool(much.any()):
+            best, least = torch.where(_each(much, x), x, best), torch.where(much, now, least)
     final = _norm(r)
-    lost = ~(final <= before)  # by rounding, or because the system is not what it should be: NaN too
+    lost = ~(final <= 10 * lowest) | ~(final <= norm)  # by rounding, or as the system is not what it should be: NaN too
     if bool(lost.any()):
-        spoilt = lost.view(-1, *[1] * (b.ndim - 1))
-        x = torch.where(spoilt, 0 if began is None else began, x)
-        final = torch.where(lost, before, final)
-    residual = final / torch.where(scale > 0, scale, 1)
-    return CGResult(x, iterations, residual, ~active)
+        x = torch.where(_each(lost, x), best, x)
+        final = torch.where(lost, least, final)
+    residual = error if by_steps else final / torch.where(scale > 0, scale, 1)
+    return CGResult(x, iterations, residual, ~active & ~lost)
+
+
+def _each(systems: Tensor, like: Tensor) -> Tensor:
+    """(N,) to stand beside the systems of `like`."""
+    return systems.view(-1, *[1] * (like.ndim - 1))
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
@@ -108,4 +124,4 @@ def _norm(a: Tensor) -> Tensor:
 def _ratio(a: Tensor, b: Tensor, where: Tensor, like: Tensor) -> Tensor:
     """a / b where `where` holds and b is not 0, else 0; shaped to scale the systems of `like`."""
     good = where & (b != 0)
-    return torch.where(good, a / torch.where(good, b, 1), 0).view(-1, *[1] * (like.ndim - 1))
+    return _each(torch.where(good, a / torch.where(good, b, 1), 0), like)

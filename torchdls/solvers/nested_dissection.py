@@ -18,7 +18,6 @@ indefinite sparse symmetric linear systems", 1983.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -26,12 +25,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchdls._caches import STORE
 from torchdls.operators import edge_ends
 
 _LEAF = 5  # longest side of a block that is not halved again
 _AT_ONCE = 2**18  # numbers of the fronts that are worked on together: they stay in the cache
 _SMALL = 12  # sides up to which an inverse is cheaper by elimination than by Cholesky's factor
-_KEPT = 4  # masks whose order of elimination is kept
 
 
 class Child(NamedTuple):
@@ -163,11 +162,11 @@ def _inverse(scaled: Tensor) -> Tensor:
 
 def elimination(alive: Tensor) -> Levels:
     """The order of elimination of the pixels (N, H, W) that are alive; the last few masks are remembered."""
-    bits = np.packbits(alive.cpu().numpy())
-    return _elimination(bits.tobytes(), tuple(alive.shape), alive.device)
+    key = np.packbits(alive.cpu().numpy()).tobytes(), tuple(alive.shape), alive.device
+    found: Levels = STORE.find((elimination, *key), lambda: _elimination(*key))
+    return found
 
 
-@lru_cache(maxsize=_KEPT)
 def _elimination(bits: bytes, shape: tuple[int, ...], device: torch.device) -> Levels:
     count = shape[0] * shape[1] * shape[2]
     flat = np.unpackbits(np.frombuffer(bits, np.uint8), count=count).astype(bool)

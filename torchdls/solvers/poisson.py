@@ -9,25 +9,22 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchdls._checks import check_alike, check_real
+from torchdls._checks import check_alike, check_numbers, check_together, check_whole
 from torchdls._precision import full_precision
-from torchdls._tracing import all_finite, only_shapes
+from torchdls._tracing import all_finite, is_concrete, only_shapes
 from torchdls.operators import GradientOperator, as_pixel_size
 from torchdls.operators.edges import edge_ends, present_edges
-from torchdls.solvers.cg import CGResult, LinearMap, conjugate_gradients
+from torchdls.solvers.cg import CGResult, conjugate_gradients
 from torchdls.solvers.components import Gauge, free_constants
 from torchdls.solvers.direct import solve_direct
-from torchdls.solvers.nested_dissection import factor
+from torchdls.solvers.normal_equations import STEEP, WEAK, Setting, directly, normal, slopes_of, squares, steep
 from torchdls.solvers.preconditioner import preconditioner
 from torchdls.solvers.units import Problem, in_units, plane_of, unit_of
 
 # Steps of conjugate gradients after which a direct factor is cheaper; pixels of a batch up to which its memory (2 GB)
-# is spent; steps that it then takes at most.
+# is spent.
 _PATIENCE = 60
 _LARGEST = 2**22
-_DIRECT_STEPS = 30
-# Anchors below this part of the weight of edges leave the constant of a component to rounding, unless it is set apart.
-_WEAK = 1e-4
 
 
 class ConvergenceWarning(UserWarning):
@@ -66,14 +63,6 @@ class SolveResult(NamedTuple):
     converged: Tensor
 
 
-class _Setting(NamedTuple):
-    """What the solve needs besides tensors."""
-
-    pixel_size: tuple[float, float]
-    tol: float
-    max_iter: int
-
-
 @full_precision
 def solve(
     v: Tensor,
@@ -95,7 +84,8 @@ def solve(
 
     Where w is None and r is one number per surface, H is diagonal in the cosine basis and the solve is direct.
     Otherwise conjugate gradients run, preconditioned by such a direct solve; where weights jump by so many orders that
-    60 steps do not suffice, a direct factor by nested dissection takes over (up to 4 million pixels). On a connected
+    60 steps do not suffice, or they are more than 1e4 apart, a direct factor by nested dissection takes over (up to 4
+    million pixels; then `tol` is an error of heights, see docs/reliability.md). On a connected
     component (of the edges with w > 0) that no anchor holds, the height has zero mean; pixels with neither edge nor
     anchor are 0. No ridge is added.
 
@@ -110,7 +100,8 @@ def solve(
 
     Args:
         v: (N, 2, H, W) slope on each edge, as `edge_slopes` gives it.
-        w: (N, 2, H, W) trust in each edge, at least 0; None for 1 everywhere.
+        w: (N, 2, H, W) trust in each edge, at least 0; None for 1 everywhere. Edges that leave the rectangle (the
+            last column of the first channel, the last row of the second) are not there.
         anchor: (N, 1, H, W) anchor heights a; None for 0.
         anchor_weight: r, at least 0: (N, 1, H, W), or (N, 1, 1, 1) or a number for a whole surface; None for 0.
         tol: relative residual at which a surface stops. The error of the height, relative to its relief, is mostly far
@@ -130,6 +121,7 @@ def solve(
         TypeError: v is not float32 or float64, or another tensor of another dtype.
         ValueError: a shape does not fit, `tol`, `max_iter` or `pixel_size` is not positive, or the height is not
             finite.
+        TypeError: v, w, anchor, anchor_weight and z0 are not tensors of one dtype, float32 or float64.
 
     Source: Simchony, Chellappa, Shao (1990) for the direct solve; Durou, Courteille (2007) for the mask.
 
@@ -138,17 +130,27 @@ def solve(
         >>> torchdls.solve(slopes).height.round(decimals=3)
         tensor([[[[-1.5000, -0.5000,  0.5000,  1.5000]]]])
     """
-    setting = _Setting(as_pixel_size(pixel_size), tol, max_iter)
-    check_real("solve", "v", v)
+    setting = Setting(as_pixel_size(pixel_size), tol, max_iter)
+    given = {"w": w, "anchor": anchor, "z0": z0}
+    check_together("solve", v=v, **{name: t for name, t in given.items() if t is not None})
     r = _as_weight(anchor_weight, v)
     _check(v, setting, w=w, anchor=anchor, anchor_weight=r, z0=z0)
     if w is None and (r is None or r[0].numel() == 1):
         return _finite(direct_result(_on_rectangle(v, anchor, r, setting.pixel_size)))
-    w = present_edges(v) if w is None else w.expand_as(v)
+    present = present_edges(v)
+    w = present if w is None else torch.where(present > 0, w, 0)
     r = None if r is None else r.expand_as(v[:, :1])
     if only_shapes(v):
         return _shapes_alone(v, w, anchor, r)
-    return _finite(_in_general(Problem(v, w, anchor, r, z0, setting.pixel_size), setting))
+    problem = Problem(v, w, anchor, r, z0, setting.pixel_size)
+    if v.dtype == torch.float64 or not is_concrete(w) or not bool(steep(w, setting).any()):
+        return _finite(_in_general(problem, setting))
+    found = _in_general(problem.double(), setting)
+    return _finite(
+        found._replace(
+            height=found.height.to(v.dtype), residual=found.residual.clamp(max=torch.finfo(v.dtype).max).to(v.dtype)
+        )
+    )
 
 
 def _finite(result: SolveResult) -> SolveResult:
@@ -174,13 +176,13 @@ def _on_rectangle(v: Tensor, anchor: Tensor | None, r: Tensor | None, pixel_size
     return z - z.mean((-2, -1), keepdim=True) + torch.where(r > 0, mean, 0)
 
 
-def _in_general(problem: Problem, setting: _Setting) -> SolveResult:
+def _in_general(problem: Problem, setting: Setting) -> SolveResult:
     """The iterative solve, on numbers of order 1 and without the plane and constants that could drown the rest."""
     problem, unit = in_units(problem)
     v, w, anchor, r, z0, pixel_size = problem
     setting = setting._replace(pixel_size=pixel_size)
     slope, level, lift, *found = _Levels.apply(v, w, anchor, r, setting)
-    force = _A(setting).adjoint(w * (v - slope))
+    force = slopes_of(setting).adjoint(w * (v - slope))
     if r is None:
         r = pull = torch.zeros_like(force)
     else:
@@ -204,19 +206,22 @@ def direct_result(z: Tensor) -> SolveResult:
     return SolveResult(z, steps, residual, torch.ones(n, dtype=torch.bool, device=device))
 
 
-def _A(setting: _Setting) -> GradientOperator:
-    return GradientOperator("forward", setting.pixel_size)
-
-
 def _as_weight(r: Tensor | float | None, like: Tensor) -> Tensor | None:
-    if r is None or (isinstance(r, Tensor) and r.ndim):
+    if r is None:
         return r
+    if isinstance(r, Tensor) and r.ndim:
+        check_together("solve", v=like, anchor_weight=r)
+        return r
+    if not isinstance(r, Tensor):
+        check_numbers("solve", anchor_weight=r)
     return torch.as_tensor(r, dtype=like.dtype, device=like.device).expand(like.shape[0], 1, 1, 1)
 
 
-def _check(v: Tensor, setting: _Setting, **fields: Tensor | None) -> None:
-    if v.ndim != 4 or v.shape[1] != 2:
+def _check(v: Tensor, setting: Setting, **fields: Tensor | None) -> None:
+    if v.ndim != 4 or v.shape[1] != 2 or 0 in v.shape:
         raise ValueError(f"solve: v {tuple(v.shape)} given, (N, 2, H, W) is needed")
+    check_numbers("solve", tol=setting.tol)
+    check_whole("solve", max_iter=setting.max_iter)
     if not setting.tol > 0 or not setting.max_iter > 0:
         raise ValueError(f"solve: tol={setting.tol!r} and max_iter={setting.max_iter!r} given, both must be positive")
     for name, field in fields.items():
@@ -242,13 +247,13 @@ class _Levels(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(v: Tensor, w: Tensor, anchor: Tensor | None, r: Tensor | None, setting: _Setting) -> tuple[Tensor, ...]:
+    def forward(v: Tensor, w: Tensor, anchor: Tensor | None, r: Tensor | None, setting: Setting) -> tuple[Tensor, ...]:
         size = (w.shape[-2], w.shape[-1])
         alive = edge_ends(w) > 0 if r is None else edge_ends(w) + r > 0
         bounds = _live_window(alive)
         rows, columns = _slices(bounds)
         cut = w[..., rows, columns], None if r is None else r[..., rows, columns]
-        gauge = free_constants(*cut, least=_WEAK).embed(rows, columns, size)
+        gauge = free_constants(*cut, least=WEAK).embed(rows, columns, size)
         slope = torch.cat([gauge.mean(v[:, i : i + 1], w[:, i : i + 1]) for i in (0, 1)], 1)
         plane = plane_of(slope, size, setting.pixel_size)
         level, lift = plane, gauge.remove(plane)
@@ -295,7 +300,7 @@ class _Solve(torch.autograd.Function):
         labels: Tensor,
         share: Tensor,
         pull: Tensor,
-        setting: _Setting,
+        setting: Setting,
     ) -> tuple[Tensor, ...]:
         z, size = torch.zeros_like(f), (f.shape[-2], f.shape[-1])
         rows, columns = _slices(bounds)
@@ -324,7 +329,7 @@ class _Solve(torch.autograd.Function):
         constants = Gauge(*gauge).constants(dz, r)
         bent = _Solve.apply(torch.zeros_like(dz), dz - r * constants, w, r, None, bounds, *gauge, ctx.setting)[0]
         adjoint = bent + constants
-        a = _A(ctx.setting)
+        a = slopes_of(ctx.setting)
         dw = -a(bent) * a(z) if ctx.needs_input_grad[2] else None
         dr = -adjoint * z if ctx.needs_input_grad[3] else None
         return bent, adjoint, dw, dr, None, None, None, None, None, None
@@ -334,7 +339,7 @@ class _Solve(torch.autograd.Function):
         ctx: Any, df: Tensor | None, ds: Tensor | None, dw: Tensor | None, dr: Tensor | None, *_: Any
     ) -> tuple[Tensor | None, ...]:
         z, w, r, bounds, *gauge = ctx.saved_tensors
-        a = _A(ctx.setting)
+        a = slopes_of(ctx.setting)
         force = torch.zeros_like(z) if df is None else df
         pull = torch.zeros_like(z) if ds is None else ds
         if dw is not None:
@@ -351,7 +356,7 @@ class _Solve(torch.autograd.Function):
         return tuple(x.unflatten(0, (info.batch_size, -1)) for x in outputs), (0,) * len(outputs)
 
 
-def _iterate(b: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, setting: _Setting) -> CGResult:
+def _iterate(b: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, setting: Setting) -> CGResult:
     """Conjugate gradients with the cosine preconditioner; with a direct factor where weights jump too much for that.
 
     The factor costs as much as `_PATIENCE` steps (measured from 128^2 to 512^2), so at worst half of the work is lost.
@@ -364,70 +369,45 @@ def _iterate(b: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, s
     if gauge.labels.shape[1]:
         (b, w, r), unit = _components_in_units(b, w, r, gauge, setting)
         z0 = None if z0 is None else z0 / unit
-    apply, start = _normal(w, r, setting), None
+    apply, start = normal(w, r, setting), None
     if gauge.pull.shape[1]:
-        diagonal = edge_ends(w / _squares(w, setting)) + r
+        diagonal = edge_ends(w / squares(w, setting)) + r
         firm = 2 * r > diagonal
         start = torch.where(firm, b / torch.where(firm, diagonal, 1), 0)
         b = gauge.balance(b - apply(start))
         z0 = None if z0 is None else z0 - start
     z0 = None if z0 is None else gauge.settle(z0)  # what it says of free constants is not for CG to mend
     patience = _PATIENCE if b[0].numel() * b.shape[0] <= _LARGEST else setting.max_iter
+    apart = steep(w, setting) & (patience < setting.max_iter)
     found = conjugate_gradients(
-        apply, preconditioner(w, r, setting.pixel_size, weak=start is not None), b, z0,
+        apply, preconditioner(w, r, setting.pixel_size, weak=start is not None),
+        torch.where(apart.view(-1, 1, 1, 1), 0, b) if bool(apart.any()) else b, z0,
         tol=setting.tol, max_iter=min(patience, setting.max_iter), project=gauge.correction(),
         deflate=gauge.deflation(),
     )  # fmt: skip
-    if not bool(found.converged.all()) and patience < setting.max_iter:
-        rest = (~found.converged).nonzero()[:, 0]
-        found = found.replace(rest, _directly(b[rest], w[rest], r[rest], found.x[rest], gauge.select(rest), setting))
+    if patience < setting.max_iter and not bool((found.converged & ~apart).all()):
+        rest = (apart | ~found.converged).nonzero()[:, 0]
+        found = found.replace(rest, directly(b[rest], w[rest], r[rest], found.x[rest], gauge.select(rest), setting))
     x = found.x if start is None else found.x + start
     x = gauge.settle(x)
     return found._replace(x=x if unit is None else x * unit)
 
 
 def _components_in_units(
-    b: Tensor, w: Tensor, r: Tensor, gauge: Gauge, setting: _Setting
+    b: Tensor, w: Tensor, r: Tensor, gauge: Gauge, setting: Setting
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
     """Weights and residuals of order 1 on every component, and the unit (N, 1, H, W) of its heights.
 
     Components do not touch, so each has a scale of its own; with one scale, the tolerance of the largest would swallow
     the others.
     """
-    stiffness = edge_ends(w / _squares(w, setting)) + r
+    stiffness = edge_ends(w / squares(w, setting)) + r
     trust = unit_of(gauge.largest(stiffness.flatten(1))).view_as(r)
     w, r, b = w / trust, r / trust, b / trust
     largest = unit_of(gauge.largest(b.abs().flatten(1)))
     norm = unit_of(gauge.sums((b.flatten(1) / largest).square()).sqrt())
     unit = (largest * norm).view_as(b)
     return (b / unit, w, r), unit
-
-
-def _directly(b: Tensor, w: Tensor, r: Tensor, x: Tensor, gauge: Gauge, setting: _Setting) -> CGResult:
-    """The same, preconditioned by a direct factor and in double precision; one step mostly, three where H is singular.
-
-    In the factor alone, one pixel of every component that nothing else holds is held by as much as its edges weigh.
-    """
-    dtype, gauge = b.dtype, gauge.double()
-    b, w, r, x = (t.double() for t in (b, w, r, x))
-    edges = edge_ends(w / _squares(w, setting))
-    held = r
-    if gauge.share.shape[1]:
-        loose = gauge.pins().view_as(r)
-        if gauge.pull.shape[1]:
-            loose = loose & (gauge.sums(r.flatten(1)).view_as(r) < _WEAK * edges)
-        held = r + torch.where(loose, edges, 0)
-    direct = factor(w, held, setting.pixel_size)
-    found = conjugate_gradients(
-        _normal(w, r, setting), lambda y: gauge.settle(direct.solve(y)), gauge.balance(b), x,
-        tol=setting.tol, max_iter=_DIRECT_STEPS, project=gauge.correction(), deflate=gauge.deflation(),
-        scale=b.flatten(1).norm(dim=1),
-    )  # fmt: skip
-    return found._replace(x=found.x.to(dtype), residual=found.residual.to(dtype))
-
-
-def _squares(like: Tensor, setting: _Setting) -> Tensor:
-    return torch.tensor(setting.pixel_size, dtype=like.dtype, device=like.device).view(1, 2, 1, 1).square()
 
 
 def fold_vmap(size: int, in_dims: tuple[int | None, ...], inputs: tuple[Any, ...]) -> list[Any]:
@@ -458,27 +438,11 @@ def _slices(bounds: Tensor) -> tuple[slice, slice]:
     return slice(top, bottom + 1), slice(left, right + 1)
 
 
-def _warn(residual: Tensor, converged: Tensor, setting: _Setting) -> None:
+def _warn(residual: Tensor, converged: Tensor, setting: Setting) -> None:
     warnings.warn(
         f"solve: {int((~converged).sum())} of {len(converged)} surfaces stopped after {setting.max_iter} iterations "
-        f"at a relative residual of up to {float(residual.max()):.1e}, above tol={setting.tol:.1e}",
+        f"at a relative residual (error, for weights {STEEP:.0e} apart) of up to {float(residual.max()):.1e}, "
+        f"where tol={setting.tol:.1e} is asked for",
         ConvergenceWarning,
         stacklevel=7,  # the caller of `solve`
     )
-
-
-def _normal(w: Tensor, r: Tensor, setting: _Setting) -> LinearMap:
-    """z -> H z = A^T (w A z) + r z, edge by edge: what flows along an edge leaves one end and enters the other."""
-    dx, dy = setting.pixel_size
-    across, down = (w[:, :1, :, :-1] / dx**2).contiguous(), w[:, 1:, :-1] / dy**2
-
-    def apply(z: Tensor) -> Tensor:
-        result = r * z
-        for weight, dim in ((across, -1), (down, -2)):
-            n = z.shape[dim] - 1
-            flow = (z.narrow(dim, 1, n) - z.narrow(dim, 0, n)).mul_(weight)
-            result.narrow(dim, 0, n).sub_(flow)
-            result.narrow(dim, 1, n).add_(flow)
-        return result
-
-    return apply

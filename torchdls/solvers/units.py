@@ -27,6 +27,11 @@ class Problem(NamedTuple):
     z0: Tensor | None
     pixel_size: tuple[float, float]
 
+    def double(self) -> Problem:
+        """In double precision."""
+        anchor, r, z0 = (None if t is None else t.double() for t in (self.anchor, self.r, self.z0))
+        return Problem(self.v.double(), self.w.double(), anchor, r, z0, self.pixel_size)
+
 
 def unit_of(x: Tensor) -> Tensor:
     """The largest power of two that is not above x >= 0, within what the dtype inverts exactly; 1 where x is 0."""

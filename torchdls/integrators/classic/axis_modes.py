@@ -118,4 +118,4 @@ def _eigenvectors(D: Tensor, B: Tensor, lam: float, order: int) -> tuple[Tensor,
     return B @ Q, s
 
 
-_packed_modes = table(_build_modes, maxsize=16)  # these tables are large
+_packed_modes = table(_build_modes)

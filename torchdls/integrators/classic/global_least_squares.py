@@ -139,7 +139,7 @@ class SpectralRegularization(GlobalLeastSquares):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(support, degree, pixel_size)
-        pair = (modes, modes) if isinstance(modes, int | float) else tuple(modes)
+        pair = tuple(modes) if isinstance(modes, Sequence) else (modes, modes)
         if len(pair) != 2 or not all(_is_count(m) for m in pair):
             wanted = "an integer of at least 1, a float in (0, 1], or a pair (rows, columns) of them"
             raise ValueError(f"SpectralRegularization: modes={modes!r} given, {wanted} is needed")
@@ -206,7 +206,7 @@ class TikhonovRegularization(GlobalLeastSquares):
         single = isinstance(lam, int | float) or (isinstance(lam, Tensor) and lam.numel() == 1)
         if not single or not 0 <= _number(lam) < float("inf"):
             raise ValueError(f"TikhonovRegularization: lam={lam!r} given, one number of at least 0 is needed")
-        if order not in (0, 1, 2):
+        if not isinstance(order, int) or order not in (0, 1, 2):
             raise ValueError(f"TikhonovRegularization: order={order!r} given, 0, 1 or 2 is needed")
         if isinstance(lam, Tensor) and not isinstance(lam, nn.Parameter):
             self.register_buffer("lam", lam.detach().clone())

@@ -8,9 +8,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers, check_whole
 from torchdls._tracing import is_concrete, seen_everywhere
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.data_term import edges_of
+from torchdls.integrators.fields import in_units
 from torchdls.operators import GradientOperator
 from torchdls.operators.edges import edge_ends
 from torchdls.solvers import ConvergenceWarning
@@ -57,6 +59,8 @@ class HornBrooks(Integrator):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(pixel_size=pixel_size)
+        check_numbers("HornBrooks", tol=tol, relaxation=relaxation)
+        check_whole("HornBrooks", max_iter=max_iter)
         if not tol > 0 or not max_iter > 0:
             raise ValueError(f"HornBrooks: tol={tol!r} and max_iter={max_iter!r} given, both must be positive")
         if not 0 < relaxation < 2:
@@ -69,6 +73,7 @@ class HornBrooks(Integrator):
 
     def _report(self, fields: Fields) -> IntegrationResult:
         """The relaxation, and how many sweeps each surface took."""
+        fields, unit = in_units(fields)
         a = GradientOperator("forward", fields.steps)
         g = fields.gradient
         mask = torch.ones_like(g[:, :1], dtype=torch.bool) if fields.mask is None else fields.mask
@@ -103,4 +108,4 @@ class HornBrooks(Integrator):
             if is_concrete(active):
                 message = f"HornBrooks: {int(active.sum())} of {len(b)} surfaces above tol={self.tol:g}"
                 warnings.warn(f"{message} after {self.max_iter} iterations", ConvergenceWarning, stacklevel=2)
-        return IntegrationResult(gauge.settle(z) + level, sweeps, ~active)
+        return IntegrationResult((gauge.settle(z) + level) * unit.slope, sweeps, ~active)

@@ -7,6 +7,7 @@ from typing import Literal
 
 from torch import Tensor
 
+from torchdls._checks import check_numbers, check_whole
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic.dirichlet import solve_dirichlet
 from torchdls.integrators.data_term import Quadratic
@@ -56,6 +57,8 @@ class LeastSquares(Integrator):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(pixel_size=pixel_size)
+        check_numbers(type(self).__name__, tol=tol)
+        check_whole(type(self).__name__, max_iter=max_iter)
         if not tol > 0 or not max_iter > 0:
             raise ValueError(f"LeastSquares: tol={tol!r} and max_iter={max_iter!r} given, both must be positive")
         if boundary not in ("neumann", "dirichlet"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_fit, check_together
 from torchdls._precision import full_precision
 from torchdls.integrators.classic.least_squares import LeastSquares
 from torchdls.integrators.data_term import Quadratic
@@ -45,6 +46,10 @@ def dls_objective(
     Returns:
         (N,).
 
+    Raises:
+        ValueError: shapes do not fit.
+        TypeError: they are not tensors of one dtype, float32 or float64.
+
     Example:
         >>> height, gradient = torch.zeros(1, 1, 16, 16), torch.zeros(1, 2, 16, 16)
         >>> patches = torchdls.Patches(8, 8)
@@ -53,8 +58,20 @@ def dls_objective(
         tensor([128.])
     """
     patches = Patches() if patches is None else patches
+    check_together("dls_objective", gradient=gradient, height=height, dictionary=dictionary, codes=codes)
     fields = LeastSquares()._check_fields(gradient, mask, weight)
+    check_fit("dls_objective", "height", height, fields.gradient, "gradient", channels=(1,))
+    if codes.ndim != 3 or dictionary.ndim != 3:
+        shapes = f"dictionary {tuple(dictionary.shape)} and codes {tuple(codes.shape)}"
+        raise ValueError(f"dls_objective: {shapes} given, (N or 1, n, K) and (N, K, L) are needed")
     valid = None if fields.mask is None else patches.extract(fields.mask.to(height.dtype)) > 0
     mu = torch.as_tensor(mu, dtype=height.dtype, device=height.device).expand(height.shape[0])
-    R = patches.extract(height) - dictionary @ codes
+    cut = patches.extract(height)
+    K = codes.shape[1]
+    if codes.shape != (len(cut), K, cut.shape[-1]) or dictionary.shape not in {
+        (n, cut.shape[1], K) for n in (1, len(cut))
+    }:
+        shapes = f"dictionary {tuple(dictionary.shape)}, codes {tuple(codes.shape)} and patches {tuple(cut.shape)}"
+        raise ValueError(f"dls_objective: {shapes} do not fit; (N or 1, n, K), (N, K, L) and (N, n, L) are needed")
+    R = cut - dictionary @ codes
     return Quadratic.of(fields).cost(height) + lam * patch_cost(R, codes, mu, valid)

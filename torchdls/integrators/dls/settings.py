@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from torchdls._checks import check_numbers
 from torchdls._registry import LEARNERS
 from torchdls._tracing import holds_everywhere
 from torchdls.dictionary.learners import DinoKat, FixedDictionary, Learner, SoupDIL
@@ -25,6 +26,7 @@ def check_run(n_iter: int, tol: float, mu: object) -> None:
     """ValueError for a number of iterations or a tolerance out of its range, or a schedule of another length."""
     if not isinstance(n_iter, int) or n_iter < 0:
         raise ValueError(f"DLS: n_iter={n_iter!r} given, an integer of at least 0 is needed")
+    check_numbers("DLS", tol=tol)
     if not tol >= 0:
         raise ValueError(f"DLS: tol={tol!r} given, a number of at least 0 is needed")
     if isinstance(mu, tuple) and len(mu) != n_iter:

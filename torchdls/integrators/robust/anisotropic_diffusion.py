@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from torchdls._checks import check_numbers
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.robust.base import Estimate, Robust
@@ -101,6 +102,8 @@ class AnisotropicDiffusion(Robust):
         [0.24, 0.1]
     """
 
+    _slopes = ("contrast",)
+
     def __init__(
         self,
         beta: float = 0.02,
@@ -112,6 +115,7 @@ class AnisotropicDiffusion(Robust):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(n_iter=n_iter, tol=tol, solve_tol=solve_tol, pixel_size=pixel_size)
+        check_numbers("AnisotropicDiffusion", beta=beta)
         if not 0 < beta <= 1:
             raise ValueError(f"AnisotropicDiffusion: beta={beta!r} given, above 0 and at most 1 is needed")
         self.beta = beta
@@ -131,7 +135,8 @@ class AnisotropicDiffusion(Robust):
                 (-3, -2, -1), keepdim=True
             ).clamp(min=1)
         else:
-            squared = g.new_full((1, 1, 1, 1), self.contrast**2)
+            most = torch.finfo(g.dtype).max ** 0.5 / 2
+            squared = g.new_full((1, 1, 1, 1), min(self.contrast, most) ** 2)
         q2 = (xx - yy).square() + 4 * xy.square()
         steep = q2 > (1e-2 * squared).square()  # below, the exponential is 0 to the last digit
         q = torch.where(steep, q2, 1).sqrt()

@@ -9,8 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm, anchored_cost, edges_of
+from torchdls.integrators.fields import in_units
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.settling import run_until_settled
 from torchdls.solvers import solve
@@ -24,6 +26,7 @@ class RobustResult(NamedTuple):
     Attributes:
         height: (N, 1, H, W).
         objective: (N, iterations + 1), from the start on, for heights in pixels; constant once a surface has stopped.
+            Of slopes beyond 2^30 or below 2^-30 (float64: 250) it is that of the same slopes brought to order 1.
         iterations: (N,) the iterations each surface took.
         converged: (N,) bool, whether it met `tol` within them.
 
@@ -67,6 +70,9 @@ class Robust(Iterative[RobustResult]):
 
     _steady = False
 
+    # Options that are slopes when they are numbers; with such a number, slopes are not brought to order 1.
+    _slopes: tuple[str, ...] = ()
+
     def __init__(
         self, *, n_iter: int, tol: float, solve_tol: float = 1e-6, pixel_size: float | Sequence[float] = 1.0
     ) -> None:
@@ -74,6 +80,7 @@ class Robust(Iterative[RobustResult]):
         name = type(self).__name__
         if not isinstance(n_iter, int) or n_iter < 0:
             raise ValueError(f"{name}: n_iter={n_iter!r} given, an integer of at least 0 is needed")
+        check_numbers(name, tol=tol, solve_tol=solve_tol)
         if not tol >= 0 or not solve_tol > 0:
             raise ValueError(f"{name}: tol={tol!r} must be at least 0, solve_tol={solve_tol!r} positive")
         self.n_iter, self.tol, self.solve_tol = n_iter, tol, solve_tol
@@ -88,6 +95,8 @@ class Robust(Iterative[RobustResult]):
 
     def _iterate(self, fields: Fields, callback: Callback | None = None) -> RobustResult:
         """The iterations, each surface until its objective settles."""
+        fields, unit = in_units(fields, all(isinstance(getattr(self, name), str) for name in self._slopes))
+        trust = unit.trust.flatten()
         data = self._data_term(fields)
         begin = self._begin(fields, data)
         flat = anchored_cost(data, fields, torch.zeros_like(begin[0])).detach()
@@ -101,11 +110,11 @@ class Robust(Iterative[RobustResult]):
             return new, cost[:, None], ~(change > self.tol * cost + rounding)
 
         problem = _Problem(fields, data, 10 * torch.finfo(flat.dtype).eps * flat)
-        return RobustResult(
-            *run_until_settled(
-                problem, begin, start, advance, self.n_iter, tol=self.tol, finish=_height, callback=callback
-            )
+        tell = None if callback is None else lambda iteration, cost: callback(iteration, cost * trust)
+        height, objective, *how = run_until_settled(
+            problem, begin, start, advance, self.n_iter, tol=self.tol, finish=_height, callback=tell
         )
+        return RobustResult(height * unit.slope, objective * trust[:, None], *how)
 
     def _begin(self, fields: Fields, data: DataTerm) -> Estimate:
         """Where to start: the least-squares surface."""

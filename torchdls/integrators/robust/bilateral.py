@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.robust.base import Estimate, Robust
@@ -83,6 +84,8 @@ class Bilateral(Robust):
         0.02
     """
 
+    _slopes = ("k",)
+
     def __init__(
         self,
         k: float = 2.0,
@@ -94,6 +97,7 @@ class Bilateral(Robust):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(n_iter=n_iter, tol=tol, solve_tol=solve_tol, pixel_size=pixel_size)
+        check_numbers("Bilateral", k=k, focal_length=focal_length)
         if not 0 < k < float("inf") or not 0 < focal_length < float("inf"):
             raise ValueError(f"Bilateral: k={k!r} and focal_length={focal_length!r} given, both must be positive")
         self.k, self.focal_length = k, focal_length

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple, cast
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers
 from torchdls._tracing import holds_everywhere
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
@@ -118,6 +119,7 @@ class _Linear(Convex):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(n_iter=n_iter, tol=tol, solve_tol=solve_tol, pixel_size=pixel_size)
+        check_numbers(type(self).__name__, smoothing=smoothing)
         if not 0 <= smoothing < float("inf"):
             raise ValueError(f"{type(self).__name__}: smoothing={smoothing!r} given, at least 0 is needed")
         self.smoothing = smoothing
@@ -233,6 +235,8 @@ class Huber(Convex):
         >>> [round(float(torchdls.rmse(method(spoilt), surface.height)), 2) for method in methods]
         [0.24, 0.02]
     """
+
+    _slopes = ("delta",)
 
     def __init__(
         self,

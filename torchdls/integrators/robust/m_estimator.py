@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.robust.base import Estimate, Robust
@@ -101,6 +102,8 @@ class MEstimator(Robust):
         [0.24, 0.1]
     """
 
+    _slopes = ("scale",)
+
     def __init__(
         self,
         loss: Literal["cauchy", "geman_mcclure", "tukey"] = "cauchy",
@@ -115,6 +118,7 @@ class MEstimator(Robust):
         super().__init__(n_iter=n_iter, tol=tol, solve_tol=solve_tol, pixel_size=pixel_size)
         if loss not in LOSSES:
             raise ValueError(f"MEstimator: loss={loss!r} is unknown; choose from {', '.join(map(repr, LOSSES))}")
+        check_numbers("MEstimator", floor=floor)
         if not 0 < floor < float("inf"):
             raise ValueError(f"MEstimator: floor={floor!r} given, a positive number is needed")
         self.loss, self.floor = loss, floor

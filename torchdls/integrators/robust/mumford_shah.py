@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers
 from torchdls._precision import full_precision
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm
@@ -107,6 +108,8 @@ class MumfordShah(Robust):
         [0.24, 0.04]
     """
 
+    _slopes = ("kappa",)
+
     def __init__(
         self,
         kappa: float | Literal["auto"] = "auto",
@@ -119,6 +122,7 @@ class MumfordShah(Robust):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(n_iter=n_iter, tol=tol, solve_tol=solve_tol, pixel_size=pixel_size)
+        check_numbers("MumfordShah", width=width, floor=floor)
         if not 0 <= width < float("inf") or not 0 < floor < float("inf"):
             raise ValueError(f"MumfordShah: width={width!r} must be at least 0, floor={floor!r} positive")
         self.kappa = positive_or_auto("MumfordShah", "kappa", kappa)

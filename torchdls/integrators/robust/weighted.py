@@ -7,10 +7,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls.integrators.base import Fields
 from torchdls.integrators.classic.least_squares import LeastSquares
 from torchdls.integrators.data_term import Quadratic
+from torchdls.integrators.fields import in_units
 from torchdls.integrators.robust.residuals import least_slope
 from torchdls.operators.edges import beside_edges, cell_curl, complete_cells, present_edges
 from torchdls.solvers import SolveResult, solve
@@ -61,6 +63,7 @@ class WeightedLeastSquares(LeastSquares):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(tol=tol, max_iter=max_iter, pixel_size=pixel_size)
+        check_numbers("WeightedLeastSquares", threshold=threshold, floor=floor)
         if not 0 < threshold < float("inf") or not 0 < floor < float("inf"):
             raise ValueError(f"WeightedLeastSquares: threshold={threshold!r} and floor={floor!r} must be positive")
         self.threshold, self.floor = threshold, floor
@@ -79,6 +82,7 @@ class WeightedLeastSquares(LeastSquares):
 
     def _trust(self, fields: Fields) -> Tensor:
         """(N, 2, H, W), q."""
+        fields, _ = in_units(fields)  # on which q does not depend
         g = fields.gradient
         valid = torch.ones_like(g, dtype=torch.bool) if fields.weight is None else (fields.weight > 0).expand_as(g)
         valid = valid if fields.mask is None else valid & fields.mask

@@ -198,4 +198,4 @@ def _seen(line: Line, double: Tensor) -> tuple[Tensor, Tensor]:
     return value, slope
 
 
-_noise = table(_build_noise, maxsize=160)
+_noise = table(_build_noise)

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
+from torchdls._checks import check_numbers
 from torchdls._tracing import is_concrete
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import Quadratic
@@ -171,19 +172,23 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         super().__init__(pixel_size=pixel_size)
         if recipe not in _RUNS:
             raise ValueError(f"SlopeDLS: recipe={recipe!r} given; choose from 'blend', 'quick', 'plain'")
-        self.patch_sizes = None if patch_sizes is None else tuple(patch_sizes)
-        sizes = (8,) if self.patch_sizes is None else self.patch_sizes
-        if not sizes or not all(isinstance(s, int) and s >= 2 for s in sizes):
+        sizes = (8,) if patch_sizes is None else patch_sizes
+        whole = isinstance(sizes, Sequence) and all(isinstance(s, int) and s >= 2 for s in sizes)
+        if not whole or not sizes:
             raise ValueError(f"SlopeDLS: patch_sizes={patch_sizes!r} given, integers of at least 2 are needed")
         if n_iter is not None and (not isinstance(n_iter, int) or n_iter < 0):
             raise ValueError(f"SlopeDLS: n_iter={n_iter!r} given, an integer of at least 0 is needed")
+        check_numbers("SlopeDLS", z_tol=z_tol, **({} if tau is None else {"tau": tau}))
         if (tau is not None and not tau >= 0) or not z_tol > 0:
             raise ValueError(f"SlopeDLS: tau={tau!r} must not be negative, z_tol={z_tol!r} must be positive")
         if guard not in ("discrepancy", "sure", None) or aggregate not in ("mean", "sparsity", None):
             known = "guard: 'discrepancy', 'sure', None; aggregate: 'mean', 'sparsity', None"
             raise ValueError(f"SlopeDLS: guard={guard!r}, aggregate={aggregate!r} given; choose from {known}")
+        if not isinstance(sigma, Tensor | None):
+            check_numbers("SlopeDLS", sigma=sigma)
         if sigma is not None and not bool((torch.as_tensor(sigma) >= 0).all()):
             raise ValueError(f"SlopeDLS: sigma={sigma!r} given, at least 0 is needed")
+        self.patch_sizes = None if patch_sizes is None else tuple(patch_sizes)
         self.tau, self.n_iter, self.learn, self.aggregate = tau, n_iter, learn, aggregate
         self.recipe, self.guard, self.robust, self.z_tol = recipe, guard, robust, z_tol
         if isinstance(sigma, Tensor) and not isinstance(sigma, nn.Parameter):

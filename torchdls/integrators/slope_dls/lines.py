@@ -178,7 +178,7 @@ def _placed_by_segment(line: Line) -> Tensor:
     return _placed(line).transpose(0, 1).flatten(0, 1)
 
 
-inside, placed, placed_by_segment = (table(build, maxsize=96) for build in (_inside, _placed, _placed_by_segment))
+inside, placed, placed_by_segment = (table(build) for build in (_inside, _placed, _placed_by_segment))
 
 
 def _from_left(a: Tensor, x: Tensor) -> Tensor:
