@@ -200,6 +200,13 @@ ELSEWHERE = {
     "load": "keep", "build": "keep", "ring_of_lights": "woodham", "solve": "solve", "add_noise": "add_noise",
     "GradientToNormals": "gradient_to_normals", "NormalsToGradient": "normals_to_gradient", "page_html": "surface_page",
     "terrain": "no argument but a size; tests/test_surfaces.py", "Learner": "a protocol", "Integrator": "abstract",
+    "Exact": "an option of DLS", "Implicit": "an option of DLS", "Proximal": "an option of DLS",
+    "Unroll": "an option of DLS", "PHOTOMETRIC": "a table", "large": "tests/test_large.py",
+    "bivariate_normals": "tests/photometric", "dlnv_normals": "tests/photometric", "dlpi_normals": "tests/photometric",
+    "lights_from_ball": "tests/photometric", "refine": "tests/photometric", "load_photographs": "tests/cli",
+    "save_normals": "tests/cli", "denoise_height": "tests/dictionary", "denoise_normals": "tests/test_normal_coder.py",
+    "normal_noise": "tests/test_normal_coder.py", "integrate_many": "tests/batch", "reconstruct": "normals_to_gradient",
+    "integrate_scattered": "tests/integrators/classic", "shrink_slow_waves": "tests/integrators/slope_dls",
     "ConvergenceWarning": "a warning", "INTEGRATORS": "integrators.py", "LEARNERS": "learner",
 }  # fmt: skip
 
