@@ -91,7 +91,7 @@ def denoise_normals(
     sizes = _sizes(name, patch_sizes, n)
     if camera is not None:
         check_camera(camera, normals)
-    if isinstance(sigma, Tensor):
+    if sigma is not None and not isinstance(sigma, int | float):
         check_alike(name, "sigma", sigma, normals.dtype)
         shape = tuple(sigma.shape)
         require(shape in {(), (1,), (len(n),)}, f"{name}: sigma {shape} given, (N,) or a number is needed")
