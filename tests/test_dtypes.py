@@ -57,7 +57,7 @@ CALLS = {
     "depth_to_points": {"depth": field(1), "camera": camera()},
     "dlnv_normals": PHOTOMETRIC | {"n_iter": 1},
     "dlpi_normals": PHOTOMETRIC | {"n_iter": 1},
-    "edge_slopes": {"gradient": field(2), "mask": mask(), "weight": field(1)},
+    "edge_slopes": {"gradient": field(2), "mask": mask(), "weight": field(1), "error": torch.ones(1, 1, 1, 1)},
     "gradient_to_normals": {"gradient": field(2), "camera": camera()},
     "guess_convention": NORMALS,
     "height_to_points": {"height": field(1)},

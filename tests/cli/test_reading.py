@@ -250,7 +250,10 @@ def test_a_large_map_is_judged_by_tiles_as_it_is_as_a_whole(perspective):
         (["--set", "pixel_size=2"], "--set: pixel_size has an option of its own, --pixel-size"),
         (["--method", "slope_dls", "--set", "sigma=abc"], "--set: sigma=abc given, which is not usable"),
         (["--method", "slope_dls", "--set", "robust=perhaps"], "--set: robust=perhaps given, True or False is needed"),
-        (["--method", "slope_dls", "--set", "patch_sizes=3.5"], "--set: patch_sizes=3.5 given, which is not usable"),
+        (
+            ["--method", "slope_dls", "--set", "patch_sizes=3.5"],
+            "patch_sizes=3.5 given, integers of at least 2 are needed",
+        ),
         (["--method", "magic"], "--method: 'magic' is unknown; choose from least_squares"),
         (["--camera", "1,2,3"], "--camera: '1,2,3' given, a file or four numbers FX,FY,CX,CY are needed"),
         (["--camera", "1,2,3,4,5"], "--camera: '1,2,3,4,5' given, a file or four numbers"),

@@ -50,7 +50,7 @@ def test_the_oracles_object():
     assert "wrote to x" in flaw("lambda x: x.add_(1)")
     assert "not finite" in flaw("lambda x: x / 0")
     assert "ZeroDivisionError" in flaw("lambda x: 1 / 0")
-    assert "in order" in flaw("lambda x: torch.ones(2).expand(torchdls.Patches(0))")
+    assert "in order" in flaw("lambda x: torch.ones(2).expand(torchdls.Patches(3, 5))")
     assert "warned" in flaw("lambda x: __import__('warnings').warn('careful') or x")
     assert "accepted" in flaw("lambda x: x", spoilt="x", must_raise=True)
     assert "names none" in flaw("lambda x: int('y')", spoilt="x")

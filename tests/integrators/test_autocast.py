@@ -60,6 +60,7 @@ def test_half_precision_is_taken_up(name, dtype):
     {"derivative": Unroll(checkpoint=True)},
     {"select": True}, {"height_step": "proximal"}, {"learn": "shared", "learner": SoupDIL("block")},
 ])  # fmt: skip
+@pytest.mark.filterwarnings("ignore::torchdls.ConvergenceWarning")  # of a NaN, see below
 def test_each_form_of_dls(options):
     integrator, g = torchdls.DLS(4, 2, 16, mu=0.3, n_iter=2, tol=0.0, **options), bumps(2).float()
     within, without = (height_and_slopes(integrator, g, {}, inside) for inside in (True, False))

@@ -42,8 +42,8 @@ def held(dtype, weight, n=(16, 14)):
     return r
 
 
-# DLS holds the heights by its patches too: a constant is not free.
-@pytest.mark.parametrize("name", [name for name in ANCHORED if name != "dls"])
+# DLS holds the heights by its patches too: a constant is not free. Piecewise chooses among surfaces, by rounding too.
+@pytest.mark.parametrize("name", [name for name in ANCHORED if name not in ("dls", "piecewise")])
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 def test_anchors_of_any_weight_carry_any_offset(name, dtype):
     g = bumps().to(dtype)

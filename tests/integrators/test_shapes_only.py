@@ -22,9 +22,8 @@ def fixed(name, **more):
     return method(name).build(name, **{**steps, **more})
 
 
-FORMS: list[tuple[str, dict[str, Any]]] = [
-    (name, {}) for name in INTEGRATORS if name != "piecewise"
-]  # its steps follow values
+# Not Piecewise, whose steps follow values.
+FORMS: list[tuple[str, dict[str, Any]]] = [(name, {}) for name in INTEGRATORS if name != "piecewise"]
 FORMS += [
     ("dls", {"learner": "fixed"}),
     ("dls", {"select": True, "mu": "auto"}),

@@ -39,6 +39,7 @@ def check_method(name: str, settings: Sequence[str] = (), option: str = "--metho
             options = ", ".join(f"{option}={_word(default)}" for option, default in known.items()) or "none"
             raise ValueError(f"--set: {name} has no option {key!r}; its options and their defaults: {options}")
         _check_option(name, key, value, known[key])
+    INTEGRATORS[name](**_options(settings))  # a ValueError of what does not go together, before any work
 
 
 def _check_option(name: str, key: str, value: Any, default: Any) -> None:

@@ -9,10 +9,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchdls._checks import check_field, check_fit
+from torchdls._checks import check_alike, check_field, check_fit, require
 from torchdls._precision import full_precision
 from torchdls.dictionary.normals import code_normals, curl_noise
-from torchdls.geometry.cameras import apply_matrix, inverse_camera, pixel_grid
+from torchdls.geometry.cameras import apply_matrix, check_camera, inverse_camera, pixel_grid
 from torchdls.geometry.conventions import NORMAL_CONVENTIONS, inverse_axes, lookup, permute
 
 
@@ -89,6 +89,12 @@ def denoise_normals(
     name = "denoise_normals"
     n, inside = _checked(name, normals, mask, convention)
     sizes = _sizes(name, patch_sizes, n)
+    if camera is not None:
+        check_camera(camera, normals)
+    if sigma is not None and not isinstance(sigma, int | float):
+        check_alike(name, "sigma", sigma, normals.dtype)
+        shape = tuple(sigma.shape)
+        require(shape in {(), (1,), (len(n),)}, f"{name}: sigma {shape} given, (N,) or a number is needed")
     if sigma is None:
         found = _noise(n, inside, convention, camera)
     else:

@@ -80,6 +80,8 @@ def edge_slopes(
         check_fit("edge_slopes", "mask", mask, gradient, "gradient", channels=(1,), dtype=torch.bool)
     if weight is not None:
         check_fit("edge_slopes", "weight", weight, gradient, "gradient", channels=(1, 2))
+    if error is not None:
+        check_fit("edge_slopes", "error", error, gradient, "gradient", channels=(1,), scalar=True)
     if mask is not None:
         gradient = torch.where(mask, gradient, 0)
     if weight is None:

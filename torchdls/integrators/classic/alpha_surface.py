@@ -8,6 +8,7 @@ from math import inf
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers, check_whole
 from torchdls._tracing import has_values
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic.curl_tree import CurlTree
@@ -63,6 +64,8 @@ class AlphaSurface(Integrator):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(pixel_size=pixel_size)
+        check_numbers("AlphaSurface", alpha=alpha, solve_tol=solve_tol)
+        check_whole("AlphaSurface", n_iter=n_iter, max_iter=max_iter)
         if not alpha >= 0:
             raise ValueError(f"AlphaSurface: alpha={alpha!r} given, a number of at least 0 is needed")
         if not n_iter > 0 or not solve_tol > 0 or not max_iter > 0:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchdls._checks import check_alike, check_real, require
+from torchdls._checks import check_alike, check_numbers, check_real, require
 from torchdls._precision import full_precision
 from torchdls.integrators.base import Fields, Integrator
 from torchdls.operators.tables import table
@@ -54,6 +54,7 @@ class BSpline(Integrator):
 
     def __init__(self, spacing: float = 2.0, *, pixel_size: float | Sequence[float] = 1.0) -> None:
         super().__init__(pixel_size=pixel_size)
+        check_numbers("BSpline", spacing=spacing)
         if not 1.1 <= spacing < math.inf:
             raise ValueError(f"BSpline: spacing={spacing!r} given, a number of at least 1.1 is needed")
         self.spacing = spacing

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls._checks import check_numbers, check_whole
 from torchdls._precision import full_precision
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic.curl_tree import CurlTree
@@ -63,6 +64,8 @@ class PartialIntegrability(Integrator):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(pixel_size=pixel_size)
+        check_numbers("PartialIntegrability", threshold=threshold, solve_tol=solve_tol)
+        check_whole("PartialIntegrability", max_iter=max_iter)
         if not threshold > 0 or not solve_tol > 0 or not max_iter > 0:
             given = f"threshold={threshold!r}, solve_tol={solve_tol!r} and max_iter={max_iter!r}"
             raise ValueError(f"PartialIntegrability: {given} given, all must be positive")

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers
 from torchdls.integrators.classic.fourier import Extension, FrankotChellappa
 
 
@@ -59,6 +60,7 @@ class Shapelets(FrankotChellappa):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(extension, pixel_size=pixel_size)
+        check_numbers("Shapelets", sigma=sigma, mult=mult)
         if not isinstance(n_scales, int) or n_scales < 1:
             raise ValueError(f"Shapelets: n_scales={n_scales!r} given, an integer of at least 1 is needed")
         if not 0 < sigma < math.inf or not 1 < mult < math.inf:

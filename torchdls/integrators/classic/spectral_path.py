@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.operators import edge_slopes
 from torchdls.operators.edges import present_edges
@@ -63,6 +64,7 @@ class SpectralPath(Integrator):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(pixel_size=pixel_size)
+        check_numbers("SpectralPath", mu=mu, solve_tol=solve_tol)
         if not 0 < mu < math.inf or not solve_tol > 0:
             raise ValueError(f"SpectralPath: mu={mu!r} and solve_tol={solve_tol!r} given, both must be positive")
         if not isinstance(n_iter, int) or n_iter < 1:

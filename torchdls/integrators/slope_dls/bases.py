@@ -81,6 +81,7 @@ class Places:
     def strips(self, surfaces: int) -> Iterator[slice]:
         """Rows of patches, as many at a time as are to be held for so many surfaces of two components."""
         rows, columns = (len(line.positions) for line in self.lines)
+        surfaces = 1 if torch.compiler.is_compiling() else surfaces  # a graph serves every batch size
         step = max(1, _AT_ONCE // (2 * surfaces * columns * self.size**2))
         return (slice(k, min(k + step, rows)) for k in range(0, rows, step))
 
