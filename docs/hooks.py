@@ -1,12 +1,16 @@
 """The reference of the site: every public name, grouped by room, and the registries as tables."""
 
 import importlib
+import inspect
 from pathlib import Path
 
 from mkdocs.structure.files import File, Files
 
 ROOMS = {
     "integrators": "Integrators",
+    "batch": "Folders of maps",
+    "reconstruction": "From a normal map to points",
+    "large": "Larger than memory",
     "selection": "Choice by predicted risk",
     "noise": "Noise",
     "geometry": "Normals, conventions, cameras",
@@ -46,7 +50,8 @@ def reference() -> str:
     rooms: dict[str, list[str]] = {room: [] for room in ROOMS}
     for name in public_names():
         value = getattr(torchdls, name)
-        module = value.__module__ if hasattr(value, "__name__") else room_of(name)
+        module = getattr(value, "__module__", None) if hasattr(value, "__name__") else None
+        module = module or room_of(name)
         rooms.setdefault(module.split(".")[1], []).append(name)
     parts = ["# Reference\n\nEvery public name; all of them import from `torchdls`.\n"]
     for room, names in rooms.items():
@@ -75,6 +80,8 @@ def entry(name: str) -> str:
     import torchdls
 
     value = getattr(torchdls, name)
+    if inspect.ismodule(value):
+        return f"::: {value.__name__}\n"
     module = getattr(value, "__module__", None)
     if module is None or not hasattr(value, "__name__"):
         return f"### {name}\n\n`torchdls.{name}`: a table of {', '.join(f'`{key}`' for key in value)}.\n"
