@@ -9,7 +9,17 @@ from torch.func import grad, jvp, vmap
 
 from tests.helpers import random_field, uniform_field
 from tests.helpers.methods import bumps, method, promising
-from torchdls import INTEGRATORS, PhotometricResult, low_rank_normals, ring_of_lights, sparse_normals, woodham
+from torchdls import (
+    INTEGRATORS,
+    PhotometricResult,
+    bivariate_normals,
+    dlnv_normals,
+    dlpi_normals,
+    low_rank_normals,
+    ring_of_lights,
+    sparse_normals,
+    woodham,
+)
 
 pytestmark = pytest.mark.device
 PLACES = 2
@@ -19,6 +29,9 @@ PHOTOMETRIC: dict[str, Callable[..., PhotometricResult]] = {
     "sparse_normals, bayes": partial(sparse_normals, n_iter=5),
     "sparse_normals, l1": partial(sparse_normals, prior="l1", n_iter=5),
     "low_rank_normals": partial(low_rank_normals, max_iter=5),
+    "bivariate_normals": partial(bivariate_normals, degree=1, n_iter=5),
+    "dlpi_normals": partial(dlpi_normals, patch_size=3, n_iter=2, mu=0.05),
+    "dlnv_normals": partial(dlnv_normals, patch_size=3, n_iter=2, mu=0.05),
 }
 
 

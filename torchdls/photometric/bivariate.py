@@ -143,7 +143,7 @@ def _split(Q: Tensor, a: Tensor, free: Tensor, n_iter: int) -> Tensor:
     scale = torch.where(scale > 0, scale, 1)
     rho = _PENALTY * scale * torch.where(free, 0, 1)
     ridge = 1e-9 * scale
-    H = torch.cholesky_inverse(torch.linalg.cholesky(Q + torch.diag_embed(rho + ridge)))
+    H = torch.linalg.inv(Q + torch.diag_embed(rho + ridge))
     Ha = H @ a
     norm = (Ha * a).sum(-1, keepdim=True)
     s = torch.full_like(rho, 1.0)

@@ -164,7 +164,7 @@ def dlnv_normals(
     eye = torch.eye(3, dtype=Y.dtype, device=Y.device)
     ridge = c.expand(len(Y), 1, *Y.shape[-2:]).permute(0, 2, 3, 1)[..., None]
     dark = ridge + torch.finfo(Y.dtype).eps * scale.view(-1, 1, 1, 1, 1)
-    inverse = torch.cholesky_inverse(torch.linalg.cholesky(gram + dark * eye))
+    inverse = torch.linalg.inv(gram + dark * eye)
 
     def update(folded: Tensor) -> Tensor:
         return torch.einsum("nhwab,nbhw->nahw", inverse, right + weight * folded)
