@@ -64,7 +64,6 @@ METHODS: dict[str, Method] = {
     "horn_brooks": Method(
         {"tol": 1e-5, "relaxation": 1.8},
         tol=2e-3,
-        no={"functional_transforms_agree": "it stops when a value says so, in plain operations, which vmap refuses"},
         exact={"default": {"relaxation": 1.5}},
     ),
     "shapelets": Method(no={"plane_is_exact": "a plane is not periodic"}),
@@ -73,7 +72,6 @@ METHODS: dict[str, Method] = {
         tol=1e-3,
         no={
             **ONE_SCALE,
-            "functional_transforms_agree": "edges are chosen by values, in plain operations, which vmap refuses",
         },
         exact={"default": {"n_iter": 3, "solve_tol": 1e-13}},
     ),
@@ -81,7 +79,6 @@ METHODS: dict[str, Method] = {
         tol=1e-3,
         no={
             **ONE_SCALE,
-            "functional_transforms_agree": "edges are chosen by values, in plain operations, which vmap refuses",
         },
         exact={"default": {"solve_tol": 1e-13}},
     ),
@@ -89,7 +86,6 @@ METHODS: dict[str, Method] = {
         tol=1e-4,
         no={
             "scales_with_the_slopes": "bends depend on how steep the surface is",
-            "functional_transforms_agree": "the path is chosen by values, in plain operations, which vmap refuses",
         },
         exact={"default": {"solve_tol": 1e-13}},
     ),

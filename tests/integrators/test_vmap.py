@@ -39,6 +39,7 @@ def per_sample(f, *tensors):
     return vmap(grad(f))(*tensors), torch.stack([grad(f)(*(t[i] for t in tensors)) for i in range(PLACES)])
 
 
+@pytest.mark.filterwarnings("ignore::torchdls.ConvergenceWarning")
 @pytest.mark.parametrize("argument", ["gradient", "weight"])
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_integrators(name, argument):
@@ -46,6 +47,8 @@ def test_integrators(name, argument):
         pytest.skip(f"{name} takes no {argument}")
     promising(name, "functional_transforms_agree")
     options = {"tol": 0.0, "n_iter": 2} if "n_iter" in INTEGRATORS.parameters(name) else {}
+    if name == "horn_brooks":  # as many sweeps for all, since none sees values
+        options = {"tol": 1e-30, "max_iter": 60}
     known = INTEGRATORS.parameters(name)
     integrator = method(name).build(name, **{k: v for k, v in options.items() if k in known})
     g = bumps(PLACES, 9, 8)

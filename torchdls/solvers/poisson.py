@@ -17,6 +17,7 @@ from torchdls.operators.edges import edge_ends, present_edges
 from torchdls.solvers.cg import CGResult, conjugate_gradients
 from torchdls.solvers.components import Gauge, free_constants
 from torchdls.solvers.direct import solve_direct
+from torchdls.solvers.folding import fold_vmap as fold_vmap
 from torchdls.solvers.normal_equations import STEEP, WEAK, Setting, directly, normal, slopes_of, squares, steep
 from torchdls.solvers.preconditioner import preconditioner
 from torchdls.solvers.units import Problem, in_units, plane_of, unit_of
@@ -408,18 +409,6 @@ def _components_in_units(
     norm = unit_of(gauge.sums((b.flatten(1) / largest).square()).sqrt())
     unit = (largest * norm).view_as(b)
     return (b / unit, w, r), unit
-
-
-def fold_vmap(size: int, in_dims: tuple[int | None, ...], inputs: tuple[Any, ...]) -> list[Any]:
-    """The dimension that vmap maps over, folded into the batch of every tensor."""
-
-    def fold(x: Any, dim: int | None) -> Any:
-        if not isinstance(x, Tensor):
-            return x
-        x = x.unsqueeze(0).expand(size, *x.shape) if dim is None else x.movedim(dim, 0)
-        return x.flatten(0, 1)
-
-    return [fold(x, d) for x, d in zip(inputs, in_dims, strict=True)]
 
 
 def _live_window(alive: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchdls._tracing import has_values
 from torchdls.solvers.components import connected_components
+from torchdls.solvers.folding import choose_per_surface
 
 
 def spanning_forest(cost: Tensor, tie: Tensor, live: Tensor) -> Tensor:
@@ -23,9 +24,15 @@ def spanning_forest(cost: Tensor, tie: Tensor, live: Tensor) -> Tensor:
     Returns:
         (N, 2, H, W) bool, the edges of the trees.
     """
+    if not has_values(live):  # shapes alone choose nothing
+        return torch.zeros_like(live)
+    return choose_per_surface(_boruvka, cost, tie, live)[0]
+
+
+def _boruvka(cost: Tensor, tie: Tensor, live: Tensor) -> tuple[Tensor]:
     kept = torch.zeros_like(live)
-    if not has_values(live) or not bool(live.any()):  # shapes alone choose nothing
-        return kept
+    if not bool(live.any()):
+        return (kept,)
     n, _, h, w = live.shape
     order = tie.flatten(1).argsort(dim=1, stable=True)
     order = order.gather(1, cost.flatten(1).gather(1, order).argsort(dim=1, stable=True))
@@ -36,7 +43,7 @@ def spanning_forest(cost: Tensor, tie: Tensor, live: Tensor) -> Tensor:
         there = torch.stack([label.roll(-1, 2), label.roll(-1, 1)], 1)
         leaving = live & (here != there)
         if not bool(leaving.any()):
-            return kept
+            return (kept,)
         price = torch.where(leaving, rank, rank.shape[1:].numel()).flatten(1)
         ends = here.flatten(1), there.flatten(1)
         least = torch.full_like(label.flatten(1), rank.shape[1:].numel())

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from tests.helpers import random_field
 from torchdls import (
+    DLS,
     SURFACES,
     Bilateral,
     LeastSquares,
@@ -268,3 +269,15 @@ def test_pieces_by_size_and_their_ties():
 def test_bad_options_are_named(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         Piecewise(**options)
+
+
+def test_as_data_term_of_dls_noise_goes_between_the_jumps():
+    slopes, height = hinged(40)
+    noisy = slopes + 0.03 * random_field(1, 2, 40, 40, seed=3)
+    alone = Piecewise()
+    both = DLS(data_term=alone, mu=0.06, n_iter=10)
+    assert Piecewise._steady
+    assert alone._data_term(alone._check_fields(noisy)).steady
+    error, before, flat = (float(rmse(method(noisy), height)) for method in (both, alone, DLS(mu=0.06, n_iter=10)))
+    assert error < 1.02 * before
+    assert error < 0.5 * flat

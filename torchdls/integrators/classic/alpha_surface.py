@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_numbers, check_whole
-from torchdls._tracing import has_values
+from torchdls._tracing import has_values, seen_everywhere
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic.curl_tree import CurlTree
 from torchdls.operators import GradientOperator
@@ -91,7 +91,7 @@ class AlphaSurface(Integrator):
             misfit = (GradientOperator("forward", fields.steps)(z) - graph.v.detach()).abs()
             added = live & ~kept & (misfit <= limit)
             more = added.flatten(1).any(1)
-            if not has_values(more) or not bool(more.any()):
+            if not has_values(more) or seen_everywhere(~more):
                 break
             kept = kept | added
         return IntegrationResult(self._solve(fields, graph.v, graph.w * kept), count, ~more)

@@ -16,7 +16,8 @@ from torchdls.integrators.fields import in_units
 from torchdls.operators import GradientOperator
 from torchdls.operators.edges import edge_ends
 from torchdls.solvers import ConvergenceWarning
-from torchdls.solvers.components import free_constants
+from torchdls.solvers.components import Gauge, free_constants
+from torchdls.solvers.folding import choose_per_surface
 
 
 class HornBrooks(Integrator):
@@ -80,7 +81,8 @@ class HornBrooks(Integrator):
         v, w = edges_of(fields._replace(mask=mask))
         assert w is not None
         r = w.new_zeros(w.shape[0], 1, 1, 1) if fields.anchor_weight is None else fields.anchor_weight
-        gauge = free_constants(w.detach(), r.detach().expand(len(w), 1, *w.shape[2:]))
+        held = r.detach().expand(len(w), 1, *w.shape[2:])
+        gauge = Gauge(*choose_per_surface(free_constants, w.detach(), held))
         b, level = a.adjoint(w * v), torch.zeros_like(w[:, :1])
         if fields.anchor is not None:  # less its constant, which sweeps would take for ever to find
             level = gauge.constants(r * fields.anchor, r.expand_as(level))

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchdls._tracing import is_concrete
 from torchdls.dictionary.normals import code_normals, curl_noise
 from torchdls.integrators.base import Fields
+from torchdls.integrators.data_term import Quadratic
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.piecewise.measured import GRAZING, believed, filled, measure
 from torchdls.integrators.piecewise.pieces import pieces_of, tied_pieces
@@ -118,6 +119,8 @@ class Piecewise(Iterative[PiecewiseResult]):
         [2.7, 0.1]
     """
 
+    _steady = True
+
     def __init__(
         self,
         focal_length: float | None = None,
@@ -139,14 +142,25 @@ class Piecewise(Iterative[PiecewiseResult]):
         """The height in the unit of `pixel_size`."""
         return result._replace(height=result.height * self._unit)
 
-    def _iterate(self, fields: Fields, callback: Callback | None = None) -> PiecewiseResult:
-        """The search, the last solve, and what it says of pieces."""
+    def _data_term(self, fields: Fields) -> Quadratic:
+        """One quadratic, once the search has found which edges hold and by how much the others jump."""
+        v, w, steps = self._held(fields)[0]
+        return Quadratic(v.to(fields.gradient.dtype), None if w is None else w.to(fields.gradient.dtype), steps)
+
+    def _held(self, fields: Fields) -> tuple[Quadratic, Tensor, tuple[Tensor, ...]]:
+        """The last quadratic, in float64; the noise; cuts, which surfaces have none, pieces, and which are tied."""
         scale = -1.0 if self.focal_length is None else self.focal_length
         slopes, noise = self._coded(fields, scale * filled(fields.gradient.double(), fields))
-        w, d, cut, smooth, pieces, tied = _Search.apply(
+        w, d, *found = _Search.apply(
             slopes, fields.mask, fields.weight, fields.anchor, fields.anchor_weight, noise, scale, fields.steps
         )
-        height = self._joined(fields, believed(slopes) / scale, w, d / scale)
+        return self._joined(fields, believed(slopes) / scale, w, d / scale), noise, tuple(found)
+
+    def _iterate(self, fields: Fields, callback: Callback | None = None) -> PiecewiseResult:
+        """The search, the last solve, and what it says of pieces."""
+        (v, w, steps), noise, (cut, smooth, pieces, tied) = self._held(fields)
+        anchor, r = (None if f is None else f.double() for f in (fields.anchor, fields.anchor_weight))
+        height = solve(v, w, anchor, r, tol=self.solve_tol, pixel_size=steps).height.to(fields.gradient.dtype)
         if not is_concrete(smooth) or bool(smooth.any()):
             even = SlopeDLS()._integrate(fields)
             height = torch.where(smooth[:, None, None, None], even, height)
@@ -170,16 +184,14 @@ class Piecewise(Iterative[PiecewiseResult]):
         coded = torch.where(inside, unit[:, :2] / torch.where(inside, facing, 1), p)
         return torch.where(noisy[:, None, None, None], coded, p), noise
 
-    def _joined(self, fields: Fields, p: Tensor, w: Tensor, d: Tensor) -> Tensor:
-        """The height of slopes p at the pixels, in float64 and back."""
+    def _joined(self, fields: Fields, p: Tensor, w: Tensor, d: Tensor) -> Quadratic:
+        """Of slopes p at the pixels, held to jumps d where edges are cut."""
         weight = None if fields.weight is None else fields.weight.double()
         v, trust = edge_slopes(p, fields.mask, weight)
         trust = present_edges(v) if trust is None else trust
         w, hold = w * trust, (trust > 0) * _HELD * (w * trust).detach().flatten(1).amax(1)[:, None, None, None]
         total = w + hold
-        v = (w * v + hold * d) / torch.where(total > 0, total, 1)
-        anchor, r = (None if f is None else f.double() for f in (fields.anchor, fields.anchor_weight))
-        return solve(v, total, anchor, r, tol=self.solve_tol, pixel_size=fields.steps).height.to(fields.gradient.dtype)
+        return Quadratic((w * v + hold * d) / torch.where(total > 0, total, 1), total, fields.steps)
 
 
 class _Search(torch.autograd.Function):
