@@ -271,13 +271,12 @@ def test_bad_options_are_named(options):
         Piecewise(**options)
 
 
-def test_as_data_term_of_dls_noise_goes_between_the_jumps():
+def test_as_data_term_of_dls_it_keeps_the_jumps():
     slopes, height = hinged(40)
     noisy = slopes + 0.03 * random_field(1, 2, 40, 40, seed=3)
     alone = Piecewise()
     both = DLS(data_term=alone, mu=0.06, n_iter=10)
     assert Piecewise._steady
     assert alone._data_term(alone._check_fields(noisy)).steady
-    error, before, flat = (float(rmse(method(noisy), height)) for method in (both, alone, DLS(mu=0.06, n_iter=10)))
-    assert error < 1.02 * before
-    assert error < 0.5 * flat
+    error, flat = (float(rmse(method(noisy), height)) for method in (both, DLS(mu=0.06, n_iter=10)))
+    assert error < 0.1 * flat
