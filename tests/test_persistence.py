@@ -372,3 +372,16 @@ def test_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_fixed_dictionary_and_trusts_round_trip() -> None:
     model = DLS(learner=FixedDictionary(), data_term=WeightedLeastSquares(threshold=2.0))
     assert repr(torchdls.build("dls", **model.options())) == repr(model)
+
+
+def test_options_that_are_objects_come_back(tmp_path: Path) -> None:
+    model = DLS(
+        mu=[0.3, 0.2], n_iter=2, learner=FixedDictionary("soft", bound=2.0), height_step=torchdls.Proximal(5, True),
+        derivative=torchdls.Implicit(1e-5),
+    )  # fmt: skip
+    again = torchdls.build("dls", **json.loads(json.dumps(model.options())))
+    torchdls.save(tmp_path / "dls.safetensors", model)
+    g = random_field(1, 2, 16, 16)
+    for other in (again, torchdls.load(tmp_path / "dls.safetensors")):
+        assert repr(other) == repr(model)
+        assert torch.equal(other(g), model(g))
