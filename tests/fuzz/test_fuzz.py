@@ -15,6 +15,7 @@ from tests.helpers import random_field, sparse_solve
 SEED, CASES, AT_ONCE = 20, 2000, 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", range(0, CASES, AT_ONCE))
 def test_cases(first):
     failed = []
