@@ -76,9 +76,9 @@ def time_case(run: Callable[[torch.Tensor], torch.Tensor], what: str, g: torch.T
 
 
 MODES: dict[str, dict[str, Any]] = {
-    "plain": {},
-    "unroll": {},
-    "checkpoint": {"derivative": Unroll(checkpoint=True)},
+    "plain": {"learner": SoupDIL("block")},
+    "unroll": {"learner": SoupDIL("block")},
+    "checkpoint": {"learner": SoupDIL("block"), "derivative": Unroll(checkpoint=True)},
     "fixed plain": {"learn": "fixed"},
     "implicit": {"learn": "fixed"},
 }
@@ -92,7 +92,7 @@ def peak(mode: str, size: int, iterations: int) -> float:
     z = DLS(n_iter=2)(part)
     torch.autograd.grad(z, part, torch.ones_like(z))  # the first call of it imports SymPy, 33 MB
     before = peak_megabytes()
-    model = DLS(n_iter=iterations, tol=0.0, learner=SoupDIL("block"), **MODES[mode])
+    model = DLS(n_iter=iterations, tol=0.0, **MODES[mode])
     if "plain" in mode:
         with torch.no_grad():
             model(g)
