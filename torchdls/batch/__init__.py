@@ -8,10 +8,10 @@ from torchdls.batch.report import Progress, Report
 from torchdls.batch.run import LARGE, Run, Setting
 
 __all__ = [
+    "LARGE",
     "Claims",
     "Integrated",
     "Job",
-    "LARGE",
     "Manner",
     "Map",
     "Progress",

@@ -19,21 +19,21 @@ from torchdls.geometry.normals import (
 )
 
 __all__ = [
-    "CodedNormals",
-    "denoise_normals",
-    "normal_noise",
-    "ConventionGuess",
     "GRADIENT_CONVENTIONS",
+    "NORMAL_CONVENTIONS",
+    "CodedNormals",
+    "ConventionGuess",
     "GradientField",
     "GradientToNormals",
-    "NORMAL_CONVENTIONS",
     "NormalsToGradient",
     "convert_gradient",
     "convert_normals",
+    "denoise_normals",
     "depth_to_points",
     "gradient_to_normals",
     "guess_convention",
     "height_to_points",
     "log_depth_to_depth",
+    "normal_noise",
     "normals_to_gradient",
 ]

@@ -129,7 +129,7 @@ class Units(NamedTuple):
     trust: Tensor
 
 
-def in_units(fields: Fields, slopes: bool = True) -> tuple[Fields, Units]:
+def normalize_fields(fields: Fields, slopes: bool = True) -> tuple[Fields, Units]:
     """The same fields with weights of order 1 and, if `slopes`, slopes whose fourth powers are within the dtype.
 
     Nothing is rounded. What is so already, weights up to 1/16 and 16, stays as it is. Anchor weights beyond all that

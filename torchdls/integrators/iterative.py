@@ -24,14 +24,14 @@ Result = TypeVar("Result", bound=HasHeight)
 
 
 class Iterative(Integrator, Generic[Result]):
-    """An integrator that iterates; a subclass provides `_iterate` and `_in_units`, and says what its result holds."""
+    """An integrator that iterates; a subclass has `_iterate`, `_to_pixel_size` and says what its result holds."""
 
     @abstractmethod
     def _iterate(self, fields: Fields, callback: Callback | None = None) -> Result:
         """The result from checked fields, with heights in pixels."""
 
     @abstractmethod
-    def _in_units(self, result: Result) -> Result:
+    def _to_pixel_size(self, result: Result) -> Result:
         """The result with its heights, and what else has their unit, in the unit of `pixel_size`."""
 
     def _integrate(self, fields: Fields) -> Tensor:
@@ -61,11 +61,11 @@ class Iterative(Integrator, Generic[Result]):
                 cost whose history the result holds.
 
         Returns:
-            The named tuple of the method, always batched: `DLSResult`, `RobustResult` or `SlopeDLSResult`.
+            The named tuple of the method, always batched, such as `DLSResult` or `RobustResult`.
 
         Raises:
             TypeError: as `forward`.
             ValueError: as `forward`.
         """
         fields = self._check_fields(gradient, mask, weight, anchor, anchor_weight)
-        return self._in_units(self._iterate(fields, callback))
+        return self._to_pixel_size(self._iterate(fields, callback))

@@ -6,7 +6,7 @@ them; whatever else they hold is shared, too.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import torch
@@ -99,7 +99,7 @@ def select(value: T, keep: Tensor) -> T:
     if isinstance(value, Tensor):
         found = value[keep] if len(value) == len(keep) else value
     elif isinstance(value, tuple):
-        found = _rebuilt(value, (select(v, keep) for v in value))
+        found = rebuilt(value, (select(v, keep) for v in value))
     return cast(T, found)
 
 
@@ -109,7 +109,7 @@ def choose(active: Tensor, new: T, old: T) -> T:
     if isinstance(new, Tensor) and isinstance(old, Tensor) and len(new) == len(active):
         found = torch.where(active.view(-1, *[1] * (new.ndim - 1)), new, old)
     elif isinstance(new, tuple) and isinstance(old, tuple):
-        found = _rebuilt(new, (choose(active, n, o) for n, o in zip(new, old, strict=True)))
+        found = rebuilt(new, (choose(active, n, o) for n, o in zip(new, old, strict=True)))
     return cast(T, found)
 
 
@@ -129,10 +129,11 @@ def _join(parts: list[_Part]) -> Any:
         first = ends[0]
         if isinstance(first, Tensor):  # what all share went through the parts as it was
             return first if all(t is first for t in ends) else torch.cat(ends)[order]
-        return _rebuilt(first, map(together, zip(*ends, strict=True))) if isinstance(first, tuple) else first
+        return rebuilt(first, map(together, zip(*ends, strict=True))) if isinstance(first, tuple) else first
 
     return together(tuple(part.end for part in parts))
 
 
-def _rebuilt(like: Any, parts: Any) -> Any:
+def rebuilt(like: Any, parts: Iterable[Any]) -> Any:
+    """A tuple, or a named tuple of the same kind, of other parts."""
     return type(like)(*parts) if hasattr(like, "_fields") else tuple(parts)

@@ -6,10 +6,10 @@ from torchdls.io.meshes import save_mesh
 from torchdls.io.photographs import NORMAL_SUFFIXES, Photographs, load_photographs, save_normals
 
 __all__ = [
-    "Field",
-    "HeightMap",
     "NORMAL_SUFFIXES",
     "OUTPUT_SUFFIXES",
+    "Field",
+    "HeightMap",
     "Photographs",
     "load_camera",
     "load_field",

@@ -42,7 +42,7 @@ class Gauge(NamedTuple):
         """Sum of x (N, H * W) over the component of each pixel."""
         return torch.zeros_like(x).scatter_add(1, self.labels, x).gather(1, self.labels)
 
-    def largest(self, x: Tensor) -> Tensor:
+    def maxima(self, x: Tensor) -> Tensor:
         """Maximum of x (N, H * W), at least 0, over the component of each pixel."""
         return torch.zeros_like(x).scatter_reduce(1, self.labels, x, "amax").gather(1, self.labels)
 

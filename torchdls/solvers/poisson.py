@@ -20,7 +20,7 @@ from torchdls.solvers.direct import solve_direct
 from torchdls.solvers.folding import fold_vmap as fold_vmap
 from torchdls.solvers.normal_equations import STEEP, WEAK, Setting, directly, normal, slopes_of, squares, steep
 from torchdls.solvers.preconditioner import preconditioner
-from torchdls.solvers.units import Problem, in_units, plane_of, unit_of
+from torchdls.solvers.units import Problem, normalize_problem, plane_of, unit_of
 
 # Steps of conjugate gradients after which a direct factor is cheaper; pixels of a batch up to which its memory (2 GB)
 # is spent.
@@ -179,7 +179,7 @@ def _on_rectangle(v: Tensor, anchor: Tensor | None, r: Tensor | None, pixel_size
 
 def _in_general(problem: Problem, setting: Setting) -> SolveResult:
     """The iterative solve, on numbers of order 1 and without the plane and constants that could drown the rest."""
-    problem, unit = in_units(problem)
+    problem, unit = normalize_problem(problem)
     v, w, anchor, r, z0, pixel_size = problem
     setting = setting._replace(pixel_size=pixel_size)
     slope, level, lift, *found = _Levels.apply(v, w, anchor, r, setting)
@@ -368,7 +368,7 @@ def _iterate(b: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, s
         b = torch.where(edge_ends(w) + r > 0, b, 0)
     unit = None
     if gauge.labels.shape[1]:
-        (b, w, r), unit = _components_in_units(b, w, r, gauge, setting)
+        (b, w, r), unit = _normalize_components(b, w, r, gauge, setting)
         z0 = None if z0 is None else z0 / unit
     apply, start = normal(w, r, setting), None
     if gauge.pull.shape[1]:
@@ -394,7 +394,7 @@ def _iterate(b: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, s
     return found._replace(x=x if unit is None else x * unit)
 
 
-def _components_in_units(
+def _normalize_components(
     b: Tensor, w: Tensor, r: Tensor, gauge: Gauge, setting: Setting
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
     """Weights and residuals of order 1 on every component, and the unit (N, 1, H, W) of its heights.
@@ -403,9 +403,9 @@ def _components_in_units(
     the others.
     """
     stiffness = edge_ends(w / squares(w, setting)) + r
-    trust = unit_of(gauge.largest(stiffness.flatten(1))).view_as(r)
+    trust = unit_of(gauge.maxima(stiffness.flatten(1))).view_as(r)
     w, r, b = w / trust, r / trust, b / trust
-    largest = unit_of(gauge.largest(b.abs().flatten(1)))
+    largest = unit_of(gauge.maxima(b.abs().flatten(1)))
     norm = unit_of(gauge.sums((b.flatten(1) / largest).square()).sqrt())
     unit = (largest * norm).view_as(b)
     return (b / unit, w, r), unit

@@ -40,7 +40,7 @@ def unit_of(x: Tensor) -> Tensor:
     return exponent.exp2()
 
 
-def in_units(problem: Problem) -> tuple[Problem, Tensor]:
+def normalize_problem(problem: Problem) -> tuple[Problem, Tensor]:
     """The same problem with slopes, weights and pixels of order 1, and the unit (N, 1, 1, 1) of its heights."""
     v, w, anchor, r, z0, (dx, dy) = problem
     length = 2.0 ** math.floor(math.log2(min(dx, dy)))

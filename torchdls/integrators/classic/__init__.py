@@ -17,17 +17,17 @@ from torchdls.integrators.classic.shapelets import Shapelets
 from torchdls.integrators.classic.spectral_path import SpectralPath
 
 __all__ = [
-    "SpectralPath",
-    "integrate_scattered",
-    "PartialIntegrability",
-    "BSpline",
     "AlphaSurface",
-    "Shapelets",
+    "BSpline",
     "FrankotChellappa",
     "HarkerOLeary",
     "HornBrooks",
     "LeastSquares",
     "LineIntegral",
+    "PartialIntegrability",
+    "Shapelets",
+    "SpectralPath",
     "SpectralRegularization",
     "TikhonovRegularization",
+    "integrate_scattered",
 ]

@@ -12,7 +12,7 @@ from torchdls._checks import check_numbers, check_whole
 from torchdls._tracing import is_concrete, seen_everywhere
 from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.data_term import edges_of
-from torchdls.integrators.fields import in_units
+from torchdls.integrators.fields import normalize_fields
 from torchdls.operators import GradientOperator
 from torchdls.operators.edges import edge_ends
 from torchdls.solvers import ConvergenceWarning
@@ -74,7 +74,7 @@ class HornBrooks(Integrator):
 
     def _report(self, fields: Fields) -> IntegrationResult:
         """The relaxation, and how many sweeps each surface took."""
-        fields, unit = in_units(fields)
+        fields, unit = normalize_fields(fields)
         a = GradientOperator("forward", fields.steps)
         g = fields.gradient
         mask = torch.ones_like(g[:, :1], dtype=torch.bool) if fields.mask is None else fields.mask

@@ -22,7 +22,7 @@ from torchdls.dictionary.learners import FixedDictionary, SoupDIL
 from torchdls.dictionary.sweep_adjoint import Codes, Sweep
 from torchdls.integrators.dls.iteration import Settings, iterate, objective, settled, update_height
 from torchdls.integrators.dls.problem import End, Problem, State, codes_pay, support
-from torchdls.integrators.settling import Settled, run_until_settled
+from torchdls.integrators.settling import Settled, rebuilt, run_until_settled
 
 
 class Kept(NamedTuple):
@@ -336,5 +336,4 @@ def _with_tensors(value: Any, tensors: Iterator[Tensor]) -> Any:
         return next(tensors) if value.is_floating_point() else value
     if not isinstance(value, tuple):
         return value
-    parts = [_with_tensors(v, tensors) for v in value]
-    return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return rebuilt(value, [_with_tensors(v, tensors) for v in value])

@@ -202,7 +202,7 @@ class DLS(Iterative[DLSResult]):
         rule, steady = self._settings.threshold, bool(self.data_term._steady)
         self._derivative = choose_derivative(derivative, self.learn, rule, steady, initial)
 
-    def _in_units(self, result: DLSResult) -> DLSResult:
+    def _to_pixel_size(self, result: DLSResult) -> DLSResult:
         """Height and codes in the unit of `pixel_size`."""
         return result._replace(height=result.height * self._unit, codes=result.codes * self._unit)
 

@@ -138,7 +138,7 @@ class Piecewise(Iterative[PiecewiseResult]):
             raise ValueError(f"Piecewise: solve_tol={solve_tol!r} given, a positive number is needed")
         self.focal_length, self.noise, self.solve_tol = focal_length, noise, solve_tol
 
-    def _in_units(self, result: PiecewiseResult) -> PiecewiseResult:
+    def _to_pixel_size(self, result: PiecewiseResult) -> PiecewiseResult:
         """The height in the unit of `pixel_size`."""
         return result._replace(height=result.height * self._unit)
 

@@ -9,10 +9,10 @@ from torchdls.integrators.robust.mumford_shah import MumfordShah
 from torchdls.integrators.robust.weighted import WeightedLeastSquares
 
 __all__ = [
+    "L1",
     "AnisotropicDiffusion",
     "Bilateral",
     "Huber",
-    "L1",
     "MEstimator",
     "MumfordShah",
     "Robust",

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchdls._checks import check_numbers
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import DataTerm, anchored_cost, edges_of
-from torchdls.integrators.fields import in_units
+from torchdls.integrators.fields import normalize_fields
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.settling import run_until_settled
 from torchdls.solvers import solve
@@ -89,13 +89,13 @@ class Robust(Iterative[RobustResult]):
     def _data_term(self, fields: Fields) -> DataTerm:
         """The data term of checked fields."""
 
-    def _in_units(self, result: RobustResult) -> RobustResult:
+    def _to_pixel_size(self, result: RobustResult) -> RobustResult:
         """The height in the unit of `pixel_size`."""
         return result._replace(height=result.height * self._unit)
 
     def _iterate(self, fields: Fields, callback: Callback | None = None) -> RobustResult:
         """The iterations, each surface until its objective settles."""
-        fields, unit = in_units(fields, all(isinstance(getattr(self, name), str) for name in self._slopes))
+        fields, unit = normalize_fields(fields, all(isinstance(getattr(self, name), str) for name in self._slopes))
         trust = unit.trust.flatten()
         data = self._data_term(fields)
         begin = self._begin(fields, data)

@@ -12,7 +12,7 @@ from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls.integrators.base import Fields
 from torchdls.integrators.classic.least_squares import LeastSquares
 from torchdls.integrators.data_term import Quadratic
-from torchdls.integrators.fields import in_units
+from torchdls.integrators.fields import normalize_fields
 from torchdls.integrators.robust.residuals import least_slope
 from torchdls.operators.edges import beside_edges, cell_curl, complete_cells, present_edges
 from torchdls.solvers import SolveResult, solve
@@ -82,7 +82,7 @@ class WeightedLeastSquares(LeastSquares):
 
     def _trust(self, fields: Fields) -> Tensor:
         """(N, 2, H, W), q."""
-        fields, _ = in_units(fields)  # on which q does not depend
+        fields, _ = normalize_fields(fields)  # on which q does not depend
         g = fields.gradient
         valid = torch.ones_like(g, dtype=torch.bool) if fields.weight is None else (fields.weight > 0).expand_as(g)
         valid = valid if fields.mask is None else valid & fields.mask

@@ -66,7 +66,7 @@ def smooth_holed(
         return heights[0]
     with torch.no_grad():
         level, n = noise.level.detach(), _probe(fields, noise)
-        moved = here.derivative(n)
+        moved = here.height_change(n)
         step = 0.1 * level[:, None, None, None]
         step = torch.where(step > 0, step, 1)
         there = _Surface(fields._replace(gradient=fields.gradient.detach() + step * n), noise.trust, tol)
@@ -98,7 +98,7 @@ class _Surface:
         guess = None if z0 is None else z0.detach()
         return solve(slopes, w, anchor, r, tol=self.tol, z0=guess, pixel_size=steps).height
 
-    def derivative(self, change: Tensor) -> Tensor:
+    def height_change(self, change: Tensor) -> Tensor:
         """What a change of the gradient does to the height of least squares."""
         anchor = None if self.fields.anchor is None else torch.zeros_like(self.fields.anchor)
         moved = _Surface(self.fields._replace(gradient=change, anchor=anchor), None, self.tol)

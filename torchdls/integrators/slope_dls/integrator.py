@@ -221,7 +221,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
             given["n_iter"] = self.n_iter
         return [replace(run, **given) for run in runs]
 
-    def _in_units(self, result: SlopeDLSResult) -> SlopeDLSResult:
+    def _to_pixel_size(self, result: SlopeDLSResult) -> SlopeDLSResult:
         """The height in the unit of `pixel_size`; slopes and their codes have none."""
         return result._replace(height=result.height * self._unit)
 
