@@ -101,7 +101,8 @@ def test_operators(name: str) -> None:
     assert gradgradcheck(operator, points, fast_mode=True, nondet_tol=1e-12)
 
 
-@pytest.mark.parametrize("case", ["rectangle", *(pytest.param(c, marks=pytest.mark.slow) for c in ("mask", "all"))])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["rectangle", "mask", "all"])
 @pytest.mark.parametrize("name, label", EXACT)
 def test_integrators(name: str, label: str, case: str) -> None:
     if label != "default" and case != "rectangle":

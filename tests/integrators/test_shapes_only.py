@@ -42,7 +42,9 @@ def arguments(integrator, g, all_of_them):
     return {} if getattr(integrator, "select", False) else given
 
 
-@pytest.mark.parametrize("all_of_them", [False, True], ids=["gradient", "everything"])
+@pytest.mark.parametrize(
+    "all_of_them", [pytest.param(False, id="gradient"), pytest.param(True, id="everything", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("name, options", FORMS)
 def test_meta_tensors_pass_through(name, options, all_of_them):
     """Shapes, dtypes and those of the derivatives, for any method, mask, weight and anchor."""
@@ -58,9 +60,8 @@ def test_meta_tensors_pass_through(name, options, all_of_them):
         assert leaf.grad.is_meta
 
 
-@pytest.mark.parametrize(
-    "name, options", [pytest.param(*f, marks=pytest.mark.slow if f[0] == "slope_dls" else ()) for f in FORMS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name, options", FORMS)
 def test_fake_tensors_pass_through(name, options):
     if name == "horn_brooks":
         pytest.skip("its sweeps are as many as values say, up to 10,000")

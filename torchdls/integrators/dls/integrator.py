@@ -63,6 +63,8 @@ class DLSResult(NamedTuple):
         mu: (N,) the threshold used, for heights in pixels.
         converged: (N,) bool, whether the height settled to `tol` before the iterations ran out.
         iterations: (N,) the iterations each surface took.
+        followed: (N,) how far the height follows the iterations away from least squares: 0 is least squares, 1 all that
+            they removed and the noise explains (`select="guard"`), or their own height where there is no guard.
 
     Example:
         >>> result = torchdls.DLS(n_iter=2).solve(torchdls.SURFACES["tent"](32).gradient)
@@ -81,6 +83,7 @@ class DLSResult(NamedTuple):
     mu: Tensor
     converged: Tensor
     iterations: Tensor
+    followed: Tensor
 
 
 class DLS(Iterative[DLSResult]):
@@ -218,11 +221,14 @@ class DLS(Iterative[DLSResult]):
             problem = choose_threshold(problem, isinstance(self.mu, str), functools.partial(self._trial, problem))
         result = self._differentiated(problem, callback)
         height = remove_free_constants(result.height, fields.mask, fields.anchor_weight)
+        followed = result.followed
         if self._guarded:
-            height = guard(height, self.data_term._integrate(fields), fields, noise)
+            height, followed = guard(height, self.data_term._integrate(fields), fields, noise)
         if window is None:
-            return result._replace(height=height)
-        return result._replace(height=window.put_back(height), codes=window.put_codes_back(result.codes))
+            return result._replace(height=height, followed=followed)
+        return result._replace(
+            height=window.put_back(height), followed=followed, codes=window.put_codes_back(result.codes)
+        )
 
     def _without_patches(self, fields: Fields, noise: Tensor) -> DLSResult:
         """The surface of the data term alone, where no patch fits or none has noise to lose: nothing to iterate."""
@@ -233,7 +239,7 @@ class DLS(Iterative[DLSResult]):
         costs = cost[:, None].expand(-1, self.n_iter + 1)
         nothing = torch.zeros_like(noise)
         lam, mu = (per_surface(name, getattr(self, name), nothing) for name in ("lam", "mu"))
-        return DLSResult(z, D, codes, costs, noise, 0 * lam, mu, nothing == 0, nothing.long())
+        return DLSResult(z, D, codes, costs, noise, 0 * lam, mu, nothing == 0, nothing.long(), nothing)
 
     @property
     def _settings(self) -> Settings:
@@ -282,7 +288,9 @@ class DLS(Iterative[DLSResult]):
         z, D, B = end.state
         rest = end.objective[:, -1:].expand(-1, self.n_iter + 1 - end.objective.shape[1])
         costs = torch.cat([end.objective, rest], 1)
-        return DLSResult(z, D, B, costs, problem.noise, problem.lam, problem.mu, end.converged, end.iterations)
+        noise, lam, mu = problem.noise, problem.lam, problem.mu
+        whole = torch.ones_like(noise)
+        return DLSResult(z, D, B, costs, noise, lam, mu, end.converged, end.iterations, whole)
 
     def _problem(self, fields: Fields, noise: Tensor) -> Problem:
         """Everything that stays the same during the iterations."""
