@@ -76,26 +76,27 @@ def second_order_tv(gradient: Tensor, weight: float, n_iter: int = 100) -> Tenso
     return z
 
 
-def methods(full: bool, n: int) -> dict[str, list[Method]]:
+def methods(n: int) -> dict[str, list[Method]]:
     """Each method as its candidates; of several the best counts, per row and measure."""
 
     def dls(mu: float) -> Method:
         return lambda g: DLS(lam=0.5, mu=mu * noise_level(g), n_iter=15, tol=0)(g)
 
-    chosen: dict[str, list[Method]] = {"SlopeDLS": [SlopeDLS()], "SlopeDLS.fast": [SlopeDLS.fast()]}
-    if full:
-        chosen["SlopeDLS, plain"] = [SlopeDLS(recipe="plain")]
-        chosen["SlopeDLS, plain, learn=False"] = [SlopeDLS(recipe="plain", learn=False)]
-        chosen["SlopeDLS, plain, guard='sure'"] = [SlopeDLS(recipe="plain", guard="sure")]
-        chosen["second-order TV, best of 4"] = [lambda g, w=w: second_order_tv(g, w) for w in WEIGHTS]
-        chosen["DLS"] = [DLS(n_iter=15, tol=0)]
-        chosen["DLS, bare"] = [DLS(n_iter=15, tol=0, select=False)]
-        chosen["DLS, best of 3"] = [dls(mu) for mu in THRESHOLDS]
-        chosen["DLS, select"] = [DLS(n_iter=15, tol=0, select=True)]
-        chosen["SR, best of 6"] = [SpectralRegularization(m) for m in MODES if m <= n]
-        chosen["TV, best of 3"] = [TotalVariation(smoothing=s) for s in SMOOTHINGS]
-        chosen["L1, best of 3"] = [L1(smoothing=s) for s in SMOOTHINGS]
-    return chosen
+    return {
+        "SlopeDLS": [SlopeDLS()],
+        "SlopeDLS.fast": [SlopeDLS.fast()],
+        "SlopeDLS, plain": [SlopeDLS(recipe="plain")],
+        "SlopeDLS, plain, learn=False": [SlopeDLS(recipe="plain", learn=False)],
+        "SlopeDLS, plain, guard='sure'": [SlopeDLS(recipe="plain", guard="sure")],
+        "second-order TV, best of 4": [lambda g, w=w: second_order_tv(g, w) for w in WEIGHTS],
+        "DLS": [DLS(n_iter=15, tol=0)],
+        "DLS, bare": [DLS(n_iter=15, tol=0, select=False)],
+        "DLS, best of 3": [dls(mu) for mu in THRESHOLDS],
+        "DLS, select": [DLS(n_iter=15, tol=0, select=True)],
+        "SR, best of 6": [SpectralRegularization(m) for m in MODES if m <= n],
+        "TV, best of 3": [TotalVariation(smoothing=s) for s in SMOOTHINGS],
+        "L1, best of 3": [L1(smoothing=s) for s in SMOOTHINGS],
+    }
 
 
 def measures(height: Tensor, surface: Surface, levels: int) -> Tensor:
@@ -114,7 +115,7 @@ def measures(height: Tensor, surface: Surface, levels: int) -> Tensor:
 
 
 def run(
-    surfaces: Iterable[Surface], snrs: Sequence[int], seeds: Sequence[int], full: bool
+    surfaces: Iterable[Surface], snrs: Sequence[int], seeds: Sequence[int], names: Sequence[str]
 ) -> tuple[list[dict[str, Any]], dict[str, float]]:
     """A row for every surface, noise level and method; and the seconds that each method took per field."""
     rows: list[dict[str, Any]] = []
@@ -129,8 +130,9 @@ def run(
         gradient = torch.cat(draws)
         fields += len(gradient)
         plain = measures(LeastSquares()(gradient), surface, len(snrs))
-        for name, candidates in methods(full, gradient.shape[-1]).items():
-            start = time.perf_counter()
+        everything = methods(gradient.shape[-1])
+        for name in names:
+            candidates, start = everything[name], time.perf_counter()
             found = torch.stack([measures(method(gradient), surface, len(snrs)) for method in candidates])
             seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
             gain = plain / found.amin(0)
@@ -169,9 +171,10 @@ def table(rows: list[dict[str, Any]], seconds: dict[str, float]) -> str:
     return markdown_table(["gain", "up to 20 dB", *(f"{s} dB" for s in snrs), "worst row"], lines) + "\n" + note + "\n"
 
 
-def surface_table(rows: list[dict[str, Any]], method: str = "SlopeDLS") -> str:
-    """The gain of one method on every surface (RMSE / 1-SSIM at the surface's data range)."""
+def surface_table(rows: list[dict[str, Any]]) -> str:
+    """The gain of the first method on every surface (RMSE / 1-SSIM at the surface's data range)."""
     snrs = sorted({r["snr"] for r in rows})
+    method = rows[0]["method"]
     found = {(r["surface"], r["snr"]): r for r in rows if r["method"] == method}
     lines = [
         [name, *(" / ".join(f"{found[name, s][m] or math.nan:.2f}" for m in MEASURES[:2]) for s in snrs)]
@@ -181,23 +184,24 @@ def surface_table(rows: list[dict[str, Any]], method: str = "SlopeDLS") -> str:
 
 
 def picture(rows: list[dict[str, Any]], path: Path) -> None:
-    """Gain against the noise level: the geometric mean of all surfaces, and every surface for SlopeDLS."""
+    """Gain against the noise level: the geometric mean of all surfaces, and every surface for the first method."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    names = [n for n in dict.fromkeys(r["method"] for r in rows) if not n.startswith("SlopeDLS,")]
+    first = rows[0]["method"]
+    names = [n for n in dict.fromkeys(r["method"] for r in rows) if not n.startswith("SlopeDLS,")] or [first]
     figure, axes = pyplot.subplots(1, 2, figsize=(11, 3.8), layout="constrained")
     snrs = sorted({r["snr"] for r in rows})
     for axis, measure in zip(axes, MEASURES[:2], strict=True):
         for surface in dict.fromkeys(r["surface"] for r in rows):
-            mine = [r for r in rows if r["surface"] == surface and r["method"] == "SlopeDLS"]
+            mine = [r for r in rows if r["surface"] == surface and r["method"] == first]
             axis.plot(snrs, [r[measure] or math.nan for r in mine], color="0.85", zorder=1)
         for k, name in enumerate(names):
             levels = [[r for r in rows if r["method"] == name and r["snr"] == s] for s in snrs]
             means = [geometric_mean(known(level, measure)) for level in levels]
-            width = 2.5 if name == "SlopeDLS" else 1.2
+            width = 2.5 if name == first else 1.2
             axis.plot(snrs, means, f"C{k}", marker="o", markersize=3, linewidth=width, label=name)
         axis.plot([], [], color="0.85", label="SlopeDLS, each surface")
         axis.axhline(1, color="black", linewidth=0.6)
@@ -215,6 +219,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="two small surfaces, one draw: does it run?")
     parser.add_argument("--quick", action="store_true", help="SlopeDLS and its fast variant alone")
+    parser.add_argument("--method", nargs="+", choices=methods(96), metavar="NAME", help="some methods instead of all")
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--snr", type=int, nargs="+", default=[1, 5, 10, 20, 30, 40, 60])
     parser.add_argument("--seeds", type=int, default=3, help="noise draws per row")
@@ -225,8 +230,9 @@ def main() -> None:
     n, snrs, names = (32, [1, 20], ["tent", "peaks"]) if args.smoke else (args.size, args.snr, args.surface)
     seeds = range(args.first_seed, args.first_seed + (1 if args.smoke else args.seeds))
     surfaces = [terrain(n) if name == "terrain" else SURFACES[name](n) for name in names or [*SURFACES, "terrain"]]
+    chosen = args.method or [*methods(n)][: 2 if args.quick else None]
     with torch.no_grad():
-        rows, seconds = run(surfaces, snrs, seeds, full=not args.quick)
+        rows, seconds = run(surfaces, snrs, seeds, chosen)
     out = args.out or results_folder(args.smoke)
     settings = {"size": n, "snr": snrs, "seeds": [*seeds]}
     path = write_json(out / "gains.json", settings=settings, seconds=seconds, rows=rows)
