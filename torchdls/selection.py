@@ -55,18 +55,42 @@ def discrepancy_guard(
         (N, 1, H, W).
     """
     shape = (height.shape[-2], height.shape[-1])
-    band = _bands(*shape, like=height).long().flatten()
-    n_bands = _most_bands(*shape)
     variance = height_noise(shape, height, pixel_size)
-    difference = dct2(height - reference)
+    return reference + idct2(within_noise(dct2(height - reference), variance, noise, allowance))
+
+
+def within_noise(difference: Tensor, variance: Tensor, noise: Tensor, allowance: float = 0.0) -> Tensor:
+    """The modes of a difference, every band of them scaled down to the energy that noise explains.
+
+    Args:
+        difference: (N, 1, H, W) cosine modes.
+        variance: (N, 1, H, W), or what broadcasts to it, of each mode for noise of standard deviation 1.
+        noise: (N,) standard deviation.
+        allowance: a in `discrepancy_guard`.
+
+    Returns:
+        (N, 1, H, W) modes.
+    """
+    shape = (difference.shape[-2], difference.shape[-1])
+    band = _bands(*shape, like=difference).long().flatten()
+    n_bands = _most_bands(*shape)
     weight = torch.where(band.view(shape) > 0, 1 / torch.where(variance > 0, variance, 1), 0)
     removed = _band_sums((difference.square() * weight).flatten(1), band, n_bands)
-    count = _band_sums(torch.ones_like(variance).view(1, -1), band, n_bands)[0]
+    count = _band_sums(difference.new_ones(1, band.numel()), band, n_bands)[0]
     allowed = noise[:, None].square() * (count + allowance * (2 * count).sqrt())
     beyond = removed > allowed
     beyond[:, 0] = False
     share = torch.where(beyond, allowed / torch.where(beyond, removed, 1), 1)
-    return reference + idct2(difference * share[:, band].view_as(height))
+    return difference * share[:, band].view_as(difference)
+
+
+def band_means(energy: Tensor) -> Tensor:
+    """(N, 1, H, W) means of the modes' energies over the bands of `discrepancy_guard`, at every mode of the band."""
+    shape = (energy.shape[-2], energy.shape[-1])
+    band = _bands(*shape, like=energy).long().flatten()
+    n_bands = _most_bands(*shape)
+    count = _band_sums(energy.new_ones(1, band.numel()), band, n_bands).clamp(min=1)
+    return (_band_sums(energy.flatten(1), band, n_bands) / count)[:, band].view_as(energy)
 
 
 def _band_sums(energy: Tensor, band: Tensor, n_bands: int) -> Tensor:

@@ -1,4 +1,5 @@
-"""SlopeDLS away from the full square with white noise: `python -m benchmarks.quality.conditions` (--smoke, --quick).
+"""Off the full square with white noise: `python -m benchmarks.quality.conditions` (--smoke, --quick, --method DLS).
+
 
 Larger surfaces, masks, terrain at three smoothings, noise of other kinds than is assumed, and gross errors. A row is a
 surface under a condition at a noise level: RMSE (and 1 - SSIM) of least squares over those of the method, means over
@@ -19,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from benchmarks.common.report import markdown_table, results_folder, write_json
-from torchdls import SURFACES, LeastSquares, SlopeDLS, Surface, add_noise, io, rmse, ssim
+from torchdls import DLS, SURFACES, LeastSquares, SlopeDLS, Surface, add_noise, io, rmse, ssim
 from torchdls.noise import noise_sigma
 from torchdls.surfaces import terrain
 
@@ -37,6 +38,10 @@ class Case(NamedTuple):
 
 def seeded(seed: int, snr: int) -> torch.Generator:
     return torch.Generator().manual_seed(977 * seed + snr)
+
+
+METHODS = {"SlopeDLS": SlopeDLS(), "SlopeDLS.fast": SlopeDLS.fast(), "DLS": DLS()}
+ROBUST = {"SlopeDLS": SlopeDLS(robust=True), "SlopeDLS.fast": SlopeDLS.fast(robust=True)}  # against gross errors
 
 
 def white(clean: Tensor, snr: int, seed: int) -> Tensor:
@@ -116,7 +121,7 @@ def cases(n: int, names: Sequence[str], large: int, folder: Path | None) -> Iter
         yield from (Case(f"gross errors: {share:.0%}", surface(name, n), gross(share)) for name in names)
 
 
-def measure(case: Case, snrs: Sequence[int], seeds: Sequence[int]) -> Iterator[dict[str, Any]]:
+def measure(case: Case, snrs: Sequence[int], seeds: Sequence[int], chosen: Sequence[str]) -> Iterator[dict[str, Any]]:
     """A row for every method and level."""
     clean, mask = case.surface.gradient, case.mask
     gradient = torch.cat([case.damage(clean, snr, k) for snr in snrs for k in seeds])
@@ -129,15 +134,14 @@ def measure(case: Case, snrs: Sequence[int], seeds: Sequence[int]) -> Iterator[d
         level, seen = (e.view(len(snrs), -1).mean(1) for e in (rmse(z, truth, mask), 1 - similar))
         return level, seen
 
-    methods = {"SlopeDLS": SlopeDLS(), "SlopeDLS.fast": SlopeDLS.fast()}
-    if case.condition.startswith("gross"):
-        methods = {"robust": SlopeDLS(robust=True), "robust, fast": SlopeDLS.fast(robust=True)}
+    methods = METHODS | (ROBUST if case.condition.startswith("gross") else {})
     plain = errors(LeastSquares()(gradient, mask))
-    for name, method in methods.items():
-        found = errors(method(gradient, mask))
+    for name in chosen:
+        found = errors(methods[name](gradient, mask))
         for k, snr in enumerate(snrs):
             gains = [float(a[k] / b[k].clamp(min=1e-9)) for a, b in zip(plain, found, strict=True)]
-            row = {"condition": case.condition, "surface": case.surface.name, "snr": snr, "method": name}
+            robust = "robust " if methods[name] is not METHODS[name] else ""
+            row = {"condition": case.condition, "surface": case.surface.name, "snr": snr, "method": robust + name}
             yield row | {"rmse": gains[0], "1-ssim": gains[1], "rmse_error": float(found[0][k])}
 
 
@@ -173,6 +177,7 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="one small surface, one level: does it run?")
     parser.add_argument("--quick", action="store_true", help="six surfaces instead of fifteen, one draw instead of two")
     parser.add_argument("--first-seed", type=int, default=2100)
+    parser.add_argument("--method", nargs="+", choices=METHODS, default=["SlopeDLS", "SlopeDLS.fast"])
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     some = ("tent", "sphere", "gaussians", "steps", "chirp", "terrain")
@@ -182,8 +187,9 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     with torch.no_grad():
         for case in cases(n, names, large, args.folder):
-            rows += measure(case, snrs, seeds)
-            print(case.condition, case.surface.name, *(f"{r['rmse']:.3f}" for r in rows[-2 * len(snrs) :]), flush=True)
+            found = [*measure(case, snrs, seeds, args.method)]
+            print(case.condition, case.surface.name, *(f"{r['rmse']:.3f}" for r in found), flush=True)
+            rows += found
     out = args.out or results_folder(args.smoke)
     path = write_json(out / "conditions.json", settings={"snr": snrs, "seeds": [*seeds], "size": n}, rows=rows)
     note = f"RMSE / 1-SSIM of least squares over that of the method, {n} x {n}, draws {seeds[0]} to {seeds[-1]}.\n\n"

@@ -125,10 +125,8 @@ class DLS(Iterative[DLSResult]):
         height_step: "exact" solves for the height; "proximal" takes a proximal gradient step as in the paper; or
             `Exact(tol=...)`, `Proximal(steps=...)`.
         select: what keeps the result safe. "guard": the height is followed away from least squares as far as what it
-            took away looks like noise (`torchdls.integrators.dls.guard`). On full rectangles with equal weights that is
-            told mode by mode: hardly ever worse than least squares, which remains where there is no noise. With masks,
-            weights or anchors the energy of the slopes tells alone, which is less sure: from 20 dB on, on textured or
-            curved relief, up to 1.5 times the error of least squares. Gross errors, too, bring least squares back and
+            took away looks like noise, mode by mode (`torchdls.integrators.dls.guard`): hardly ever worse than least
+            squares, which remains where there is no noise. Gross errors, too, bring least squares back and
             are not mended. False: the height of the iterations, as in the paper. "auto": "guard" for mu="auto" and
             the data term `LeastSquares`, else False. True: predict for each surface the risk of several thresholds
             without the truth (`torchdls.select`), and take the best, or least squares (lam = 0) where none promises to
@@ -223,7 +221,8 @@ class DLS(Iterative[DLSResult]):
         height = remove_free_constants(result.height, fields.mask, fields.anchor_weight)
         followed = result.followed
         if self._guarded:
-            height, followed = guard(height, self.data_term._integrate(fields), fields, noise)
+            reference = self.data_term._integrate(fields)
+            height, followed = guard(height, reference, result.codes, fields, noise)
         if window is None:
             return result._replace(height=height, followed=followed)
         return result._replace(
