@@ -1,6 +1,5 @@
 """Off the full square with white noise: `python -m benchmarks.quality.conditions` (--smoke, --quick, --method DLS).
 
-
 Larger surfaces, masks, terrain at three smoothings, noise of other kinds than is assumed, and gross errors. A row is a
 surface under a condition at a noise level: RMSE (and 1 - SSIM) of least squares over those of the method, means over
 fresh draws of noise from seed 2100 on, on which nothing was chosen. With a folder of objects (see `real_maps`) their
@@ -20,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from benchmarks.common.report import markdown_table, results_folder, write_json
-from torchdls import DLS, SURFACES, LeastSquares, SlopeDLS, Surface, add_noise, io, rmse, ssim
+from torchdls import DLS, SURFACES, Integrator, LeastSquares, SlopeDLS, Surface, add_noise, io, rmse, ssim
 from torchdls.noise import noise_sigma
 from torchdls.surfaces import terrain
 
@@ -40,8 +39,11 @@ def seeded(seed: int, snr: int) -> torch.Generator:
     return torch.Generator().manual_seed(977 * seed + snr)
 
 
-METHODS = {"SlopeDLS": SlopeDLS(), "SlopeDLS.fast": SlopeDLS.fast(), "DLS": DLS()}
-ROBUST = {"SlopeDLS": SlopeDLS(robust=True), "SlopeDLS.fast": SlopeDLS.fast(robust=True)}  # against gross errors
+METHODS: dict[str, Integrator] = {"SlopeDLS": SlopeDLS(), "SlopeDLS.fast": SlopeDLS.fast(), "DLS": DLS()}
+ROBUST: dict[str, Integrator] = {
+    "SlopeDLS": SlopeDLS(robust=True),
+    "SlopeDLS.fast": SlopeDLS.fast(robust=True),
+}  # against gross errors
 
 
 def white(clean: Tensor, snr: int, seed: int) -> Tensor:
