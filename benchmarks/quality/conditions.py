@@ -40,10 +40,8 @@ def seeded(seed: int, snr: int) -> torch.Generator:
 
 
 METHODS: dict[str, Integrator] = {"SlopeDLS": SlopeDLS(), "SlopeDLS.fast": SlopeDLS.fast(), "DLS": DLS()}
-ROBUST: dict[str, Integrator] = {
-    "SlopeDLS": SlopeDLS(robust=True),
-    "SlopeDLS.fast": SlopeDLS.fast(robust=True),
-}  # against gross errors
+# Against gross errors.
+ROBUST: dict[str, Integrator] = {"SlopeDLS": SlopeDLS(robust=True), "SlopeDLS.fast": SlopeDLS.fast(robust=True)}
 
 
 def white(clean: Tensor, snr: int, seed: int) -> Tensor:
