@@ -11,7 +11,7 @@ from torchdls._checks import check_field, check_fit, check_numbers, require
 from torchdls._precision import full_precision
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls._tracing import holds_everywhere
-from torchdls.operators import as_pixel_size, dst2, edge_slopes
+from torchdls.operators import as_pixel_size, dst2, edge_slopes, present_edges
 from torchdls.operators.cosine import cosine_matrix
 from torchdls.operators.edges import cell_curl, cell_edges, complete_cells, mean_trust
 from torchdls.operators.sine import squared_sines
@@ -118,6 +118,24 @@ def noise_if_told(
     local, spectral = _robust_scale(even, cells), _spectral_scale(even * scale, dx, dy)
     sigma = torch.where(_stationary(mask, weight), torch.minimum(local, spectral), local)
     return sigma * unit, cells.flatten(1).any(1)
+
+
+def edge_noise_if_told(v: Tensor, w: Tensor | None, pixel_size: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """Noise (N,) of slopes measured on the edges (N, 2, H, W), for trust 1, and whether a cell tells it (N,).
+
+    The robust scale of the sums around cells, each over its own standard deviation for independent slopes of variances
+    1/w.
+    """
+    dx, dy = pixel_size
+    if min(v.shape[-2:]) < 2:
+        return v.new_zeros(v.shape[0]), torch.zeros(v.shape[0], dtype=torch.bool, device=v.device)
+    w = present_edges(v).expand_as(v) if w is None else w
+    spread = cell_edges(torch.where(w > 0, 1 / torch.where(w > 0, w, 1), 0))
+    variance = dx * dx * spread[:, :2].sum(1) + dy * dy * spread[:, 2:].sum(1)
+    cells = complete_cells(w > 0)
+    unit = unit_of(v.detach().abs().amax((1, 2, 3)))
+    curl = torch.where(cells, cell_curl(v / unit[:, None, None, None], pixel_size), 0)
+    return _robust_scale(curl / torch.where(cells, variance, 1).sqrt(), cells) * unit, cells.flatten(1).any(1)
 
 
 def _trusts(gradient: Tensor, mask: Tensor | None, weight: Tensor | None) -> Tensor:

@@ -18,7 +18,7 @@ from torchdls._precision import full_precision
 from torchdls._tracing import all_finite
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.fields import Fields as Fields
-from torchdls.integrators.fields import check_accepted, check_values, fit_fields, within_mask
+from torchdls.integrators.fields import check_accepted, check_values, edge_fields, fit_fields, within_mask
 from torchdls.operators import as_pixel_size
 
 Callback = Callable[[int, Tensor], None]
@@ -70,6 +70,9 @@ class Integrator(nn.Module, ABC):
     # which have no data term.
     _steady: bool | None = None
 
+    # Whether the method sees the slopes only on the edges of the grid, so that they can be given there (`from_edges`).
+    _reads_edges: bool = False
+
     def __init__(self, *, pixel_size: float | Sequence[float] = 1.0) -> None:
         super().__init__()
         self.pixel_size = as_pixel_size(pixel_size)
@@ -107,6 +110,47 @@ class Integrator(nn.Module, ABC):
         height = self._integrate(fields)
         height = self._finite(height if self._unit == 1 else height * self._unit)
         return height if gradient.ndim == 4 else height[0]
+
+    @full_precision
+    def from_edges(
+        self,
+        slopes: Tensor,
+        trust: Tensor | None = None,
+        mask: Tensor | None = None,
+        anchor: Tensor | None = None,
+        anchor_weight: Tensor | float | None = None,
+    ) -> Tensor:
+        r"""Integrate slopes that are known between the pixels rather than at them.
+
+            min  1/2 \sum_e w_e ((A z)_e - v_e)^2 + ...   or the method's own data term, once per edge
+
+        For sensors and methods that measure differences of heights, and to release single edges (w_e = 0), for
+        instance along a known jump. Edges without trust are never read, NaN included.
+
+        Args:
+            slopes: v, (N, 2, H, W) or (2, H, W): [:, 0, i, j] between the columns j and j + 1 (the last column is not
+                read), [:, 1, i, j] between the rows i and i + 1 (the last row is not read), as `edge_slopes` gives.
+            trust: w, (N, 2, H, W) or (N, 1, H, W), at least 0: inverse variances; None for equal trust.
+            mask: (N, 1, H, W) bool; edges with an end outside are not there.
+            anchor: see `forward`.
+            anchor_weight: see `forward`.
+
+        Returns:
+            Height as of `forward`; zero mean over each part that trusted edges connect and no anchor holds.
+
+        Raises:
+            TypeError: as `forward`.
+            ValueError: as `forward`, or the method reads slopes at pixels.
+
+        Example:
+            >>> v, w = torchdls.edge_slopes(torch.ones(1, 2, 1, 4), torch.ones(1, 1, 1, 4, dtype=torch.bool))
+            >>> w[..., 0, 0, 1] = 0  # released: two parts
+            >>> torchdls.LeastSquares().from_edges(v, w).round(decimals=3)
+            tensor([[[[-0.5000,  0.5000, -0.5000,  0.5000]]]])
+        """
+        height = self._integrate(self._check_edges(slopes, trust, mask, anchor, anchor_weight))
+        height = self._finite(height if self._unit == 1 else height * self._unit)
+        return height if slopes.ndim == 4 else height[0]
 
     if TYPE_CHECKING:  # the call of `nn.Module` gives Any
 
@@ -205,6 +249,23 @@ class Integrator(nn.Module, ABC):
         """Side h = sqrt(dx dy) of a square pixel of the same area: the height that is 1 inside the solvers."""
         return sqrt(self.pixel_size[0] * self.pixel_size[1])
 
+    def _check_edges(
+        self,
+        slopes: Tensor,
+        trust: Tensor | None,
+        mask: Tensor | None,
+        anchor: Tensor | None,
+        anchor_weight: Tensor | float | None,
+    ) -> Fields:
+        """Validate the arguments of `from_edges` and bring them to the form of `Fields`."""
+        name = type(self).__name__
+        require(self._reads_edges, f"{name}: takes no slopes on edges; LeastSquares, L1, Huber, MEstimator and DLS do")
+        check_accepted(name, self.accepts, mask=mask, anchor=anchor, anchor_weight=anchor_weight)
+        check_field(name, "slopes", slopes, 2)
+        checked = within_mask(name, fit_fields(name, torch.zeros_like(slopes), mask, None, anchor, anchor_weight))
+        check_values(name, checked)
+        return self._in_pixels(edge_fields(name, slopes, trust, checked))
+
     def _check_fields(
         self,
         gradient: Tensor,
@@ -219,6 +280,10 @@ class Integrator(nn.Module, ABC):
         check_field(name, "gradient", gradient, 2)
         fields = within_mask(name, fit_fields(name, gradient, mask, weight, anchor, anchor_weight))
         check_values(name, fields)
+        return self._in_pixels(fields)
+
+    def _in_pixels(self, fields: Fields) -> Fields:
+        """The fields for heights in units of one pixel."""
         h = self._unit
         return fields._replace(
             anchor=None if fields.anchor is None else fields.anchor / h,

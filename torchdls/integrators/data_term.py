@@ -33,6 +33,8 @@ class DataTerm(Protocol):
 
 def edges_of(fields: Fields) -> tuple[Tensor, Tensor | None]:
     """Slopes v and trusts w on the edges of the grid; weights count beside what averaging itself errs by."""
+    if fields.on_edges:
+        return fields.gradient, fields.weight
     if fields.weight is None:
         return edge_slopes(fields.gradient, fields.mask)
     error = averaging_error(fields.gradient, fields.mask, fields.weight, fields.steps)

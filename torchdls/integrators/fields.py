@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchdls._checks import check_fit, require
 from torchdls._tracing import all_finite, holds_everywhere
+from torchdls.operators import edge_slopes, present_edges
 from torchdls.solvers.units import unit_of
 
 
@@ -18,12 +19,13 @@ class Fields(NamedTuple):
     With h = sqrt(dx dy), heights are divided by h and anchor weights multiplied by h^2. Slopes have no unit and stay.
 
     Attributes:
-        gradient: (N, 2, H, W).
+        gradient: (N, 2, H, W), at the pixels, or on the edges between them (`on_edges`).
         mask: (N, 1, H, W) bool, or None for full rectangles.
-        weight: (N, 1 or 2, H, W), or None for equal trust.
+        weight: (N, 1 or 2, H, W), in the same places, or None for equal trust.
         anchor: (N, 1, H, W), or None.
         anchor_weight: (N, 1, H, W), or (N, 1, 1, 1) for one number per surface, or None.
         steps: (dx / h, dy / h), the sides of a pixel of unit area.
+        on_edges: whether slopes and weights are those of the edges, as `edge_slopes` lays them out.
     """
 
     gradient: Tensor
@@ -32,6 +34,7 @@ class Fields(NamedTuple):
     anchor: Tensor | None
     anchor_weight: Tensor | None
     steps: tuple[float, float]
+    on_edges: bool = False
 
 
 def check_accepted(name: str, accepts: frozenset[str], **given: object) -> None:
@@ -64,7 +67,7 @@ def fit_fields(
 
 def within_mask(name: str, fields: Fields) -> Fields:
     """Zero outside the mask, and anchors zero where they are not trusted: NaN there goes no further."""
-    gradient, mask, weight, anchor, trust, steps = fields
+    gradient, mask, weight, anchor, trust, steps, on_edges = fields
     if mask is not None:
         some = holds_everywhere(mask.flatten(1).any(1))
         require(some, f"{name}: mask {tuple(mask.shape)} is False everywhere on a surface")
@@ -73,7 +76,23 @@ def within_mask(name: str, fields: Fields) -> Fields:
         trust = None if trust is None else torch.where(mask, trust, 0)
     if anchor is not None and trust is not None:
         anchor = torch.where(trust > 0, anchor, 0)
-    return Fields(gradient, mask, weight, anchor, trust, steps)
+    return Fields(gradient, mask, weight, anchor, trust, steps, on_edges)
+
+
+def edge_fields(name: str, slopes: Tensor, trust: Tensor | None, fields: Fields) -> Fields:
+    """Fields whose slopes, and trusts if any, are those of the edges; edges that leave the mask or the image go."""
+    trust = fit_field(name, "trust", trust, slopes, channels=(1, 2))
+    v = slopes if slopes.ndim == 4 else slopes[None]
+    inside = None if fields.mask is None else edge_slopes(v, fields.mask)[1]
+    there = (present_edges(v) if inside is None else inside) > 0
+    w = None
+    if trust is not None or fields.mask is not None:
+        w = torch.where(there, torch.ones_like(v) if trust is None else trust.expand_as(v), 0)
+        require(all_finite(w) and holds_everywhere(w >= 0), f"{name}: trust {tuple(w.shape)} is negative or not finite")
+        there = w > 0
+    v = torch.where(there, v, 0)
+    require(all_finite(v), f"{name}: slopes {tuple(v.shape)} are not finite on edges that are trusted")
+    return fields._replace(gradient=v, weight=w, on_edges=True)
 
 
 def check_values(name: str, fields: Fields) -> None:
@@ -109,7 +128,7 @@ def fit_field(
 
 def has_even_trust(fields: Fields, weight: Tensor | None = None) -> Tensor:
     """(N, 1, 1, 1) bool: a full rectangle with equal trust and no anchor, where the noise of the height is known."""
-    full = torch.ones_like(fields.gradient[:, :1, :1, :1], dtype=torch.bool)
+    full = torch.full_like(fields.gradient[:, :1, :1, :1], not fields.on_edges, dtype=torch.bool)
     if fields.mask is not None:
         full = full & (largest_per_surface(~fields.mask) == 0)
     for w in (fields.weight, weight):
@@ -135,7 +154,7 @@ def normalize_fields(fields: Fields, slopes: bool = True) -> tuple[Fields, Units
     Nothing is rounded. What is so already, weights up to 1/16 and 16, stays as it is. Anchor weights beyond all that
     changes a height in the dtype act as that.
     """
-    g, _, weight, anchor, r, _ = fields
+    g, _, weight, anchor, r, *_ = fields
     one = torch.ones_like(g[:, :1, :1, :1])
     trust = one if weight is None else unit_of(weight.detach().abs().amax((1, 2, 3), keepdim=True))
     trust = torch.where((trust > 16) | (trust < 1 / 16), trust, 1)

@@ -67,6 +67,7 @@ class LeastSquares(Integrator):
         self.max_iter = max_iter
         self.boundary = boundary
         self._steady = True if boundary == "neumann" else None  # the quadratic does not hold a border
+        self._reads_edges = boundary == "neumann"
 
     def _integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""
@@ -85,7 +86,7 @@ class LeastSquares(Integrator):
         """The solve and how it went, from a warm start z0."""
         if self.boundary == "dirichlet":
             return solve_dirichlet(fields, tol=self.tol, max_iter=self.max_iter, z0=z0)
-        if fields.mask is None and fields.weight is None and fields.anchor is None:
+        if fields.mask is None and fields.weight is None and fields.anchor is None and not fields.on_edges:
             return direct_result(integrate_direct(fields.gradient, fields.steps))
         v, w, _ = self._data_term(fields)
         return solve(

@@ -116,10 +116,10 @@ def relative_variance(fields: Fields, exact: Tensor) -> Tensor:
 
 def _noise_heights(fields: Fields) -> list[Tensor]:
     """Least-squares heights of samples of the noise, the same for every surface; anchors are met without it."""
-    gradient, mask, weight, anchor, r, steps = fields
+    gradient, mask, weight, anchor, r, steps, on_edges = fields
     error = scale = None
     if weight is not None:
-        error = averaging_error(gradient, mask, weight, steps)
+        error = None if on_edges else averaging_error(gradient, mask, weight, steps)
         some = weight > 0
         scale = torch.where(some, (mean_trust(weight) / torch.where(some, weight, 1)).sqrt(), 0)
     rest = None if anchor is None else torch.zeros_like(anchor)
@@ -129,8 +129,8 @@ def _noise_heights(fields: Fields) -> list[Tensor]:
         n = torch.randn(gradient.shape[1:], generator=generator, dtype=torch.float64, device="cpu")
         n = n.to(gradient).expand_as(gradient)
         n = n if scale is None else n * scale
-        n = n if mask is None else torch.where(mask, n, 0)
-        v, w = edge_slopes(n, mask, weight, error=error)
+        n = n if mask is None or on_edges else torch.where(mask, n, 0)
+        v, w = (n, weight) if on_edges else edge_slopes(n, mask, weight, error=error)
         heights.append(solve(v, w, rest, r, tol=_TOL, pixel_size=steps).height)
     return heights
 

@@ -39,7 +39,7 @@ from torchdls.integrators.dls.settings import (
 from torchdls.integrators.dls.window import live_window
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.settling import run_until_settled
-from torchdls.noise import noise_if_told
+from torchdls.noise import edge_noise_if_told, noise_if_told
 from torchdls.operators import Patches
 from torchdls.solvers import remove_free_constants
 
@@ -315,8 +315,16 @@ class DLS(Iterative[DLSResult]):
         if weight is not None:  # a common factor of the weights is no news about the noise
             count = (weight > 0).sum((-3, -2, -1), keepdim=True).clamp(min=1)
             weight = weight * count / weight.sum((-3, -2, -1), keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
-        level, told = noise_if_told(fields.gradient, fields.mask, weight, fields.steps)
+        if fields.on_edges:
+            level, told = edge_noise_if_told(fields.gradient, weight, fields.steps)
+        else:
+            level, told = noise_if_told(fields.gradient, fields.mask, weight, fields.steps)
         return torch.where(told, level, math.nan)
+
+    @property
+    def _reads_edges(self) -> bool:  # type: ignore[override]
+        """As its data term does."""
+        return self.data_term._reads_edges
 
     @property
     def _guarded(self) -> bool:

@@ -37,6 +37,7 @@ class Window(NamedTuple):
             cut(fields.anchor),
             cut(fields.anchor_weight),
             fields.steps,
+            fields.on_edges,
         )
 
     def put_back(self, image: Tensor) -> Tensor:

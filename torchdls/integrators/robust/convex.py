@@ -204,6 +204,7 @@ class L1(_Linear):
     """
 
     _joint = False
+    _reads_edges = True
 
 
 class Huber(Convex):
@@ -237,6 +238,7 @@ class Huber(Convex):
     """
 
     _slopes = ("delta",)
+    _reads_edges = True
 
     def __init__(
         self,

@@ -103,6 +103,7 @@ class MEstimator(Robust):
     """
 
     _slopes = ("scale",)
+    _reads_edges = True
 
     def __init__(
         self,

@@ -53,8 +53,12 @@ class Terms(NamedTuple):
 
     @classmethod
     def of(cls, fields: Fields, *, joint: bool) -> Terms:
-        """The terms of checked fields."""
+        """The terms of checked fields; slopes on edges are measured once, and count as much as from both ends."""
         g = fields.gradient
+        if fields.on_edges:
+            w = present_edges(g) if fields.weight is None else fields.weight
+            live = torch.stack([w > 0, torch.zeros_like(w, dtype=torch.bool)], 1)
+            return cls(g[:, None], 2 * w[:, None], live, fields.steps, joint, False)
         there = edge_slopes(g, fields.mask)[1]
         trust = torch.ones_like(g[:, :1]) if fields.weight is None else fields.weight
         live = (_spread(present_edges(g) if there is None else there, joint) > 0) & (trust > 0)[:, None]
