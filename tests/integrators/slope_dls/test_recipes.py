@@ -1,13 +1,15 @@
 """The runs, their blend and the slow waves: against brute force, independent optimisers and simulated noise."""
 
+import numpy as np
 import pytest
 import torch
+from scipy.fft import dctn, idctn
 from scipy.optimize import minimize
 
 from tests.helpers import DISK, random_field, seeded
 from torchdls import SURFACES, LeastSquares, SlopeDLS, add_noise, rmse, ssim
 from torchdls.integrators.slope_dls.bases import Places
-from torchdls.integrators.slope_dls.blend import least_in_simplex, signs, sure_weights
+from torchdls.integrators.slope_dls.blend import blend_by_waves, least_in_simplex, signs, sure_weights
 from torchdls.integrators.slope_dls.known import Known
 from torchdls.integrators.slope_dls.lines import atoms
 from torchdls.integrators.slope_dls.runs import FOUR, HOLED, Run, smooth
@@ -160,6 +162,36 @@ def test_blend_finds_the_factor_of_a_linear_filter():
     best = -float((weight * D * error).sum() / (weight * D * D).sum())
     assert 0.1 < best < 0.9
     assert abs(float(w) - best) < 0.05
+
+
+def test_slow_waves_and_the_others_have_weights_of_their_own():
+    """Against the definition, the quadratic programs solved by SciPy: the risk of a part, and a fifth of the other."""
+    h, w, sigma = 40, 56, 0.7
+    frequency = np.hypot(np.arange(h)[:, None] / (2 * h), np.arange(w) / (2 * w))
+    slow = frequency < 1 / 32
+    reference, moved = (random_field(1, 1, h, w, seed=k) for k in (1, 2))
+    heights, changes = random_field(3, 1, h, w, seed=3)[:, None], 0.3 * random_field(3, 1, h, w, seed=4)[:, None]
+    heights, changes = reference + 0.3 * (heights - reference) - 0.5 * moved, changes + 0.5 * moved
+    level = torch.tensor([sigma], dtype=torch.float64)
+    D, push, change = (
+        dctn(t.numpy(), norm="ortho", axes=(-2, -1)) for t in (heights - reference, moved, changes - moved)
+    )
+    S = height_noise((h, w), reference).numpy()
+    W = np.divide(1, np.sqrt(S), out=np.zeros_like(S), where=S > 0)
+    found = np.zeros((h, w))
+    for part in (slow, ~slow):
+        scale = W * np.where(part, 1, 0.2)
+        G = np.einsum("hw,mnchw,knchw->mk", scale, D, D)
+        b = sigma**2 * np.einsum("hw,nchw,mnchw->m", scale, push, change)
+        best = minimize(
+            lambda x, G=G, b=b: 0.5 * x @ G @ x + b @ x, np.full(3, 0.2), method="SLSQP", tol=1e-14,
+            bounds=[(0, 1)] * 3, constraints={"type": "ineq", "fun": lambda x: 1 - x.sum()},
+        ).x  # fmt: skip
+        found += part * np.einsum("m,mhw->hw", best, D[:, 0, 0])
+    truth = reference + torch.from_numpy(idctn(found, norm="ortho"))
+    blend = blend_by_waves(heights, changes, reference, moved, level)
+    assert (blend - reference).norm() > 0.05 * reference.norm()
+    torch.testing.assert_close(blend, truth, atol=1e-5, rtol=1e-5)
 
 
 def test_signs_are_balanced_and_uncorrelated():

@@ -7,9 +7,13 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
+from torchdls.integrators.slope_dls.waves import slow_waves
 from torchdls.noise import height_noise
-from torchdls.operators import dct2
+from torchdls.operators import dct2, idct2
 from torchdls.operators.tables import table
+
+_PERIOD = 32.0  # of the slow waves, in pixels
+_SHARED = 0.2  # of the risk of the other part
 
 
 def signs(like: Tensor) -> Tensor:
@@ -58,17 +62,67 @@ def sure_weights(
 
     Source: Stein (1981); Ramani, Blu, Unser, "Monte-Carlo SURE", IEEE TIP 17(9), 2008.
     """
-    shape = (reference.shape[-2], reference.shape[-1])
-    variance = height_noise(shape, reference, pixel_size)
-    weight = torch.where(variance > 0, torch.where(variance > 0, variance, 1).pow(-norm), 0)
-    push = dct2(moved.detach())
-    D = dct2((heights - reference).detach()).movedim(0, 1).flatten(2)
-    along = (weight * push * dct2((changes - moved).detach())).movedim(0, 1).flatten(2).sum(2)
-    G = (D * weight.flatten()) @ D.mT
-    b = noise.detach().square()[:, None] * along
+    weight = _weight(reference, pixel_size, norm)
+    D, push, change = (dct2(t.detach()) for t in (heights - reference, moved, changes - moved))
+    return _least_risk(*_risk(D, push, change, weight, noise)).to(reference)
+
+
+def blend_by_waves(
+    heights: Tensor,
+    changes: Tensor,
+    reference: Tensor,
+    moved: Tensor,
+    noise: Tensor,
+    pixel_size: tuple[float, float] = (1.0, 1.0),
+    norm: float = 0.5,
+) -> Tensor:
+    r"""z_ls + sum_m w_m (z_m - z_ls), with weights of their own for the slow waves (period above 32) and the others.
+
+    What sees the slow waves best need not be best in the fine ones. Each part has the weights of `sure_weights` for its
+    own risk, to which a fifth of that of the other part is added: few modes make it scatter.
+
+    Args:
+        heights: see `sure_weights`, and so for the others.
+        changes: without a derivative.
+        reference: the least-squares height.
+        moved: without a derivative.
+        noise: without a derivative.
+        pixel_size: (dx, dy).
+        norm: 0 to 1.
+
+    Returns:
+        (N, 1, H, W); differentiable in the heights and the reference, with the weights held fixed.
+    """
+    weight = _weight(reference, pixel_size, norm)
+    slow = slow_waves((reference.shape[-2], reference.shape[-1]), _PERIOD, reference)
+    D, push, change = dct2(heights - reference), dct2(moved), dct2(changes - moved)
+    parts = slow, ~slow
+    risks = [_risk(D.detach(), push, change, torch.where(part, weight, 0), noise) for part in parts]
+    found = torch.zeros_like(D[0])
+    for part, own, other in zip(parts, risks, reversed(risks), strict=True):
+        w = _least_risk(*(a + _SHARED * b for a, b in zip(own, other, strict=True))).to(reference)
+        found = found + torch.where(part, (w.mT[:, :, None, None, None] * D).sum(0), 0)
+    return reference + idct2(found)
+
+
+def _weight(reference: Tensor, pixel_size: tuple[float, float], norm: float) -> Tensor:
+    """(H, W) W."""
+    variance = height_noise((reference.shape[-2], reference.shape[-1]), reference, pixel_size)
+    return torch.where(variance > 0, torch.where(variance > 0, variance, 1).pow(-norm), 0)
+
+
+def _risk(D: Tensor, push: Tensor, change: Tensor, weight: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """G (N, M, M) and b (N, M), from cosine modes (M, N, 1, H, W)."""
+    along = (weight * push * change).movedim(0, 1).flatten(2).sum(2)
+    D = D.movedim(0, 1).flatten(2)
+    return (D * weight.flatten()) @ D.mT, noise.detach().square()[:, None] * along
+
+
+def _least_risk(G: Tensor, b: Tensor) -> Tensor:
+    """(N, M) in double precision, whatever the unit of the heights."""
     scale = G.diagonal(dim1=1, dim2=2).mean(1)
     scale = torch.where(scale > 0, scale, 1)
-    return least_in_simplex((G / scale[:, None, None]).double(), (b / scale[:, None]).double()).to(reference)
+    return least_in_simplex((G / scale[:, None, None]).double(), (b / scale[:, None]).double())
 
 
 def least_in_simplex(G: Tensor, b: Tensor) -> Tensor:

@@ -99,7 +99,8 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
 
     tau falls from 1.6 to 0.3 over 8 iterations, and the grid of the patches shifts from one to the next. The recipe
     "blend" does so in four ways (along rows and columns, along the diagonals, with equal weights, and with small
-    patches alone), and blends the four heights by Stein's unbiased risk estimate from a second round on probed data.
+    patches alone), and blends the four heights by Stein's unbiased risk estimate from a second round on probed data,
+    slow waves and the others with weights of their own.
     At last, cosine modes of the height of periods above 32 pixels, which patches hardly see, are shrunk
     (`shrink_slow_waves`), and where little of the noise was found, as on texture, least squares is returned
     (`cautious`). "quick" is one run of 6 iterations with equal weights, about a tenth of the work.

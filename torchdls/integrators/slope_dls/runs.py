@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from torchdls._tracing import is_concrete
 from torchdls.integrators.slope_dls.bases import Places
-from torchdls.integrators.slope_dls.blend import signs, sure_weights
+from torchdls.integrators.slope_dls.blend import blend_by_waves, signs
 from torchdls.integrators.slope_dls.coding import Coded, average
 from torchdls.integrators.slope_dls.known import Known
 from torchdls.integrators.slope_dls.waves import cautious, shrink_slow_waves
@@ -215,7 +215,7 @@ def _blend(
     steps: tuple[float, float],
     guard: bool,
 ) -> Tensor:
-    """z_ls + sum_m w_m (z_m - z_ls), with the weights from a second round of the runs on probed data."""
+    """The runs' heights as `blend_by_waves` has them, from a second round of the runs on probed data."""
     with torch.no_grad():
         n, level = signs(gradient).expand_as(gradient), noise.detach()
         step = 0.1 * level[:, None, None, None]
@@ -224,8 +224,8 @@ def _blend(
         again = _least_squares(probed, steps)
         moved = [[again, *run.heights(probed, again, level, steps, guard)][-1] for run in runs]
         changes = (torch.stack(moved) - heights.detach()) / step
-        w = sure_weights(heights.detach(), changes, start.detach(), _least_squares(n, steps), level, steps)
-    return start + (w.mT[:, :, None, None, None] * (heights - start)).sum(0)
+        pushed = _least_squares(n, steps)
+    return blend_by_waves(heights, changes, start, pushed, level, steps)
 
 
 def _least_squares(gradient: Tensor, steps: tuple[float, float]) -> Tensor:

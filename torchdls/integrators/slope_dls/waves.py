@@ -62,7 +62,7 @@ def shrink_slow_waves(
         shapes = f"height {tuple(height.shape)} and noise {tuple(noise.shape)}"
         raise ValueError(f"shrink_slow_waves: {shapes} given, (N, 1, H, W) and (N,) are needed")
     shape = (height.shape[-2], height.shape[-1])
-    slow = _slow(shape, period, height)
+    slow = slow_waves(shape, period, height)
     eigenvalue = neumann_eigenvalues(shape, height, pixel_size)
     s2 = noise.square()[:, None, None, None] * height_noise(shape, height, pixel_size) * eigenvalue
     x2 = dct2(reference).square() * eigenvalue
@@ -112,7 +112,7 @@ def cautious(
     return reference + (share / _LEAST_CUT - 1).clamp(0, 1)[:, None, None, None] * (height - reference)
 
 
-def _slow(shape: tuple[int, int], period: float, like: Tensor) -> Tensor:
+def slow_waves(shape: tuple[int, int], period: float, like: Tensor) -> Tensor:
     """(H, W) bool: the modes of longer period, without the mean."""
     rows, columns = (torch.arange(n, dtype=like.dtype, device=like.device) / (2 * n) for n in shape)
     frequency = (rows.square()[:, None] + columns.square()).sqrt()
