@@ -89,6 +89,8 @@ CALLS = {
     "sparse_normals": PHOTOMETRIC | {"n_iter": 2},
     "ssim": MEASURED | {"data_range": 1.0},
     "surface_page": {"heights": {"height": field(1)}, "mask": mask()},
+    "surface_preview": {"height": field(1), "gradient": field(2), "truth": field(1), "mask": mask(), "trust": field(1),
+                        "jump": field(2)},
     "terrain": {"n": 16},
     "woodham": PHOTOMETRIC,
 }  # fmt: skip

@@ -26,7 +26,7 @@ MAY_IMPORT |= {
     "metrics": {"operators", "geometry"},
     "photometric": {"operators", "solvers", "dictionary", "geometry"},
     "io": {"geometry"},
-    "plot": {"geometry", "metrics"},
+    "plot": {"operators", "geometry", "metrics"},
     "persistence": {"integrators"},
     "reconstruction": {"operators", "geometry", "integrators"},
     "large": {"operators", "geometry"},

@@ -112,6 +112,72 @@ def test_nothing_global_changes():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+# --- the preview ---------------------------------------------------------------------------------------------------
+
+
+def shown_maps(figure):
+    """Title on the left -> the array of each map with a colour bar, and the label of the bar."""
+    maps = {a.get_title(loc="left"): a.images[0] for a in figure.axes if a.images}
+    return {
+        name: (image.get_array(), image.colorbar and image.colorbar.ax.get_ylabel()) for name, image in maps.items()
+    }
+
+
+def test_preview_shows_each_map_that_is_given_with_its_unit():
+    truth, height = surface(), noisy(0) + 7
+    mask = torch.ones(1, 1, 40, 60, dtype=torch.bool)
+    mask[..., :20] = False
+    gradient = torch.zeros(1, 2, 40, 60, dtype=torch.float64)
+    trust, jump = torch.ones(1, 1, 40, 60), torch.zeros(1, 2, 40, 60)
+    trust[..., 10, 30], jump[:, 1, 20, 40] = 0.25, 0.7
+    extra = {"gradient": gradient, "truth": truth, "trust": 4 * trust, "jump": jump}
+    figure = plot.surface_preview(height, mask=mask, title="Test", unit="mm", **extra)
+    maps = shown_maps(figure)
+    assert [*maps][:4] == ["Relief", "Height", "Measured normals", "Residual"]
+    units = {name: unit for name, (_, unit) in maps.items() if unit}
+    assert units["Height"] == "mm"
+    assert (units["Residual"], units["Trust in the slopes"], units["Jumps"]) == (
+        "slope",
+        "of the largest",
+        "probability",
+    )
+    assert maps["Trust in the slopes"][0][10, 30] == 0.25
+    assert maps["Jumps"][0][20, 40] == pytest.approx(0.7)
+    (error,) = [array for name, (array, _) in maps.items() if name.startswith("Error, RMSE")]
+    found = (height - truth)[0, 0, :, 20:].numpy()
+    np.testing.assert_allclose(error[:, 20:], found - found.mean(), atol=1e-12)
+    assert all(np.ma.getmaskarray(maps[name][0])[:, :20].all() for name in units)  # blank outside the mask
+    assert set(shown_maps(plot.surface_preview(height))) == {"Relief", "Height"}
+    plot.surface_preview(height, gradient=gradient, mask=trust < 1)  # a lone pixel has no edge
+    figure.savefig(io.BytesIO(), format="png")
+
+
+def test_the_residual_is_that_of_the_edges_of_a_pixel():
+    z, gradient = noisy(1), torch.randn(1, 2, 40, 60, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    found = shown_maps(plot.surface_preview(z, gradient=gradient, pixel_size=(2.0, 0.5)))["Residual"][0]
+    h, (gx, gy) = z[0, 0].numpy(), gradient[0].numpy()
+    for i, j in [(0, 0), (7, 11), (39, 59), (20, 0)]:
+        steps = [(i, j - 1, i, j), (i, j, i, j + 1)], [(i - 1, j, i, j), (i, j, i + 1, j)]
+        misfits = [
+            (h[c, d] - h[a, b]) / size - (g[a, b] + g[c, d]) / 2
+            for edges, g, size in zip(steps, (gx, gy), (2.0, 0.5), strict=True)
+            for a, b, c, d in edges
+            if min(a, b) >= 0 and c < 40 and d < 60
+        ]
+        assert found[i, j] == pytest.approx(np.sqrt(np.mean(np.square(misfits))))
+
+
+def test_the_relief_of_a_depth_is_turned_towards_the_viewer():
+    """Depth falls where the surface rises; an exact gradient of its logarithm leaves no residual."""
+    log_depth = -surface() / 100
+    gradient = torch.stack(torch.gradient(log_depth[0, 0], dim=(1, 0)))[None]
+    maps = shown_maps(plot.surface_preview(log_depth.exp(), gradient=gradient, quantity="depth"))
+    rise = shown_maps(plot.surface_preview(surface()))
+    assert {"Relief", "Depth", "Residual"} <= set(maps)
+    np.testing.assert_allclose(maps["Relief"][0], rise["Relief"][0], atol=1e-6)
+    assert maps["Residual"][0][1:-1, 1:-1].max() < 1e-3
+
+
 # --- the page ------------------------------------------------------------------------------------------------------
 
 
@@ -146,6 +212,26 @@ def test_page_is_decimated_and_in_true_proportions():
     assert flat.layout.scene.aspectratio.z == pytest.approx(0.125)
 
 
+def test_a_page_of_points_lies_where_they_do():
+    points = torch.randn(1, 3, 20, 30, generator=torch.Generator().manual_seed(0))
+    (trace,) = plot.surface_page({"z": points}).data
+    for axis, found in enumerate((trace.x, trace.y, trace.z)):
+        np.testing.assert_allclose(found, points[0, axis], atol=1e-6)
+
+
+def test_the_title_and_buttons_of_the_page_are_text_that_breaks():
+    """Nothing of them is left in the drawing, where a narrow window would cut it off."""
+    page = plot.surface_page({"a": surface(), "b <": noisy()}, notes={"a": "first"}, title="A & B")
+    html = plot.page_html(page)
+    header = html[html.index("<header>") : html.index("</header>")]
+    assert header.count("<h1>A &amp; B</h1>") == 1
+    assert re.findall(r"<button>(.*?)</button>", header) == ["a", "b &lt;"]
+    assert len(re.findall(r"<p( hidden)?>", header)) == 2
+    assert '"updatemenus"' not in html.partition("Plotly.newPlot")[2]
+    assert "A & B" not in html
+    assert "<button>" not in plot.page_html(plot.surface_page({"a": surface()}))
+
+
 # --- bad input -----------------------------------------------------------------------------------------------------
 
 
@@ -157,6 +243,8 @@ def test_page_is_decimated_and_in_true_proportions():
         ("no valid pixel", lambda z: plot.surface_page({"a": z * torch.nan})),
         ("max_side: 1", lambda z: plot.surface_page({"a": z}, max_side=1)),
         (r"height: shape \(1, 60\)", lambda z: plot.hillshade(z[0, 0, :1])),
+        ("quantity: 'width'", lambda z: plot.surface_preview(z, quantity="width")),
+        (r"jump: shape \(1, 1, 40, 60\)", lambda z: plot.surface_preview(z, jump=z)),
     ],
 )
 def test_bad_input_names_the_argument(match, call):

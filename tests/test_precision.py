@@ -91,7 +91,7 @@ OTHERS = {
     "integrate_many",
     "ring_of_lights", "dct_dictionary", "terrain", "guess_convention", "build", "load", "save", "load_camera",
     "load_field", "load_height", "load_mask", "load_photographs", "save_normals", "save_height", "save_mesh",
-    "compare_heights", "hillshade", "page_html", "surface_page",
+    "compare_heights", "hillshade", "page_html", "surface_page", "surface_preview",
 }  # fmt: skip
 _CAST = torch.empty(0).device.type
 

@@ -107,6 +107,7 @@ from .plot import compare_heights as compare_heights
 from .plot import hillshade as hillshade
 from .plot import page_html as page_html
 from .plot import surface_page as surface_page
+from .plot import surface_preview as surface_preview
 from .reconstruction import Reconstruction as Reconstruction
 from .reconstruction import reconstruct as reconstruct
 from .selection import Selection as Selection

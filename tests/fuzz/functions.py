@@ -395,6 +395,21 @@ def compare_case(rng: random.Random) -> dict[str, str]:
     return {"truth": "None", **pages_case(rng)}
 
 
+def preview_case(rng: random.Random) -> dict[str, str]:
+    d = Draw(rng, 3)
+    d.n = 1
+    return {
+        "height": d.tensor(1),
+        **d.maybe(
+            gradient=d.tensor(2),
+            truth=d.tensor(1),
+            trust=f"{d.tensor(1)}.abs()",
+            jump=f"{d.tensor(2)}.abs()",
+            mask=d.mask(),
+        ),
+    }
+
+
 def select_case(rng: random.Random) -> dict[str, str]:
     d = Draw(rng, 12)
     one = "lambda g: torchdls.FrankotChellappa()(g)"

@@ -192,6 +192,7 @@ TARGETS: dict[str, Target] = {
 PICTURES: dict[str, Target] = {
     "torchdls.compare_heights": Target(fn.compare_case),
     "torchdls.surface_page": Target(fn.pages_case),
+    "torchdls.surface_preview": Target(fn.preview_case),
 }
 # Public names that other cases call or read: by themselves they are nothing to fuzz.
 ELSEWHERE = {

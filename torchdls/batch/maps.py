@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from torchdls.io.formats import SIGNATURES
 from torchdls.io.reading import Reading, read_normals
 
 NORMALS, MASK, CAMERA = "normal_map", "mask", "K.txt"
+LOG_DEPTH_GRADIENT = "log_depth_gradient"  # in NPZ files; as `gradient` it would be read as slopes of a height
 
 
 class Source(NamedTuple):
@@ -144,12 +145,15 @@ def _gradient(path: str, field: Field, convention: str | None, camera: Tensor | 
     return Reading(gradient, mask, convention, ())
 
 
-def write_map(path: str | os.PathLike[str], height: Tensor, of: Map, *, overwrite: bool = False) -> None:
-    """The height of a map in the format of the suffix; under a camera the depth, with its points."""
+def write_map(path: str | os.PathLike[str], height: Tensor, of: Map, *, overwrite: bool = False, **maps: Any) -> None:
+    """The height of a map in the format of the suffix, with more arrays for an NPZ; under a camera the depth."""
+    slopes = of.gradient[0]
     if of.camera is None:
-        told = of.gradient[0]
-        io.save_height(path, height, mask=of.mask, pixel_size=of.pixel_size, overwrite=overwrite, gradient=told)
+        io.save_height(
+            path, height, mask=of.mask, pixel_size=of.pixel_size, overwrite=overwrite, gradient=slopes, **maps
+        )
         return
     depth = log_depth_to_depth(height)
     points = depth_to_points(depth, of.camera)
-    io.save_height(path, depth, mask=of.mask, points=points, quantity="depth", overwrite=overwrite, camera=of.camera)
+    maps |= {LOG_DEPTH_GRADIENT: slopes, "camera": of.camera}
+    io.save_height(path, depth, mask=of.mask, points=points, quantity="depth", overwrite=overwrite, **maps)

@@ -59,7 +59,7 @@ def _demo_surface(arguments: argparse.Namespace, folder: Path, name: str, surfac
         integrator = build_method(method, (1.0, 1.0))
         start = time.perf_counter()
         with torch.no_grad():
-            height, _ = run_method(f"{name}, {label}", integrator, arguments.quiet, noisy)
+            height = run_method(f"{name}, {label}", integrator, arguments.quiet, noisy).height
         seconds = time.perf_counter() - start
         m = describe(height, surface.height, data_range=surface.data_range, gradient=surface.gradient)
         row = (

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 from torchdls._conventions import AUTO, GRADIENT_CONVENTIONS, NORMAL_CONVENTIONS
 from torchdls._registry import INTEGRATORS
 from torchdls.cli.methods import build_method, check_method, run_method
+from torchdls.cli.pictures import OUTPUTS, Shown, check_outputs, is_picture, maps_of, write_picture
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchdls.batch import Manner, Source
+    from torchdls.batch import Manner, Map, Source
 
 
 METHOD = "slope_dls"
@@ -33,14 +34,14 @@ def add_integrate(commands: Any) -> None:
     add("input", metavar="INPUT", help="normal map: PNG, JPEG, TIFF, EXR, BMP, TGA or WebP; arrays: NPY, or NPZ or MAT "
         "with `gradient` or `normals` and optionally `mask`, `weight`, `pixel_size`; or a folder with normal_map.png "
         "and optionally mask.png and K.txt")  # fmt: skip
-    add("-o", "--out", action="append", required=True, metavar="OUT",
-        help="NPZ, NPY, TIFF (32-bit), PNG (16-bit), PLY, OBJ, STL or GLB; may be repeated")  # fmt: skip
+    add("-o", "--out", action="append", required=True, metavar="OUT", help=OUTPUTS)
     add("--method", default=METHOD, help=f"{', '.join(INTEGRATORS)} (default: {METHOD})")
     add("--set", action="append", default=[], metavar="NAME=VALUE", help="option of the method, such as lam=0.5")
     add("--mask", metavar="FILE", help="image or array; white or nonzero is valid")
     add_manner(command)
     add("--tile", type=int, metavar="N", help="least_squares of a full NPY, Zarr or TIFF of floats, larger than memory "
         "if need be, N rows or columns at a time, to NPY, Zarr or BigTIFF")  # fmt: skip
+    add("--unit", metavar="NAME", help="unit of the heights, for the labels of pictures, such as mm")
     add("--force", action="store_true", help="replace output files that exist")
     add("--quiet", action="store_true", help="no progress bar and no report")
     command.set_defaults(run=_integrate)
@@ -79,29 +80,30 @@ def manner(arguments: argparse.Namespace) -> Manner:
 def _integrate(arguments: argparse.Namespace) -> None:
     import torch
 
-    from torchdls import io
-    from torchdls._files import check_output
     from torchdls.batch import read_map, write_map
     from torchdls.io.packing import describe
 
     if arguments.tile is not None:
         return _integrate_large(arguments)
     check_method(arguments.method, arguments.set)  # what would fail after the work shall fail before it
-    for path in arguments.out:
-        check_output(path, arguments.force, suffixes=io.OUTPUT_SUFFIXES)
+    check_outputs(arguments.out, arguments.force)
     source = _source(arguments)
     found = read_map(source, manner(arguments))
     method = build_method(arguments.method, found.pixel_size, arguments.set)
     start = time.perf_counter()
     with torch.no_grad():
         fields = {"mask": found.mask, "weight": found.weight}
-        height, noise = run_method(arguments.method, method, arguments.quiet, found.gradient, **fields)
+        result = run_method(arguments.method, method, arguments.quiet, found.gradient, **fields)
     seconds = time.perf_counter() - start
     for note in found.notes:  # now that the method has taken its input: an error is one line alone
         if not arguments.quiet or "warning" in note:
             print(note, file=sys.stderr)
+    height, noise, maps = result.height, result._asdict().get("noise"), maps_of(result, found.mask, found.weight)
     for path in arguments.out:
-        write_map(path, height, found, overwrite=arguments.force)
+        if is_picture(path):
+            _write_picture(path, height, found, maps, arguments)
+        else:
+            write_map(path, height, found, overwrite=arguments.force, **{name: maps[name][0] for name in maps})
     if not arguments.quiet:
         if found.kind == "normals":
             print(f"{source.path}: read as {describe(found.packing)}, convention {found.convention}")
@@ -109,6 +111,15 @@ def _integrate(arguments: argparse.Namespace) -> None:
         pixels = f"{int(found.mask.sum())} of {h * w} pixels" if found.mask is not None else f"{h} x {w} pixels"
         level = "" if noise is None else f", noise {float(noise):.3g} in the slopes,"
         print(f"{arguments.method}: {pixels}{level} in {seconds:.2f} s -> {', '.join(arguments.out)}")
+
+
+def _write_picture(path: str, height: Tensor, found: Map, maps: dict[str, Any], arguments: Any) -> None:
+    from torchdls.geometry import log_depth_to_depth
+
+    surface = height if found.camera is None else log_depth_to_depth(height)
+    shown = Shown(surface, found.mask, found.pixel_size, found.gradient, camera=found.camera, **maps)
+    title = f"{Path(arguments.input).name}, {arguments.method}"
+    write_picture(path, shown, title=title, unit=arguments.unit, overwrite=arguments.force)
 
 
 def _integrate_large(arguments: argparse.Namespace) -> None:

@@ -1,4 +1,4 @@
-"""The command line: `torchdls integrate`, `batch`, `photometric`, `demo`, `methods`.
+"""The command line: `torchdls integrate`, `view`, `batch`, `photometric`, `demo`, `methods`.
 
 PyTorch is imported when a command runs, so `torchdls --help` answers at once. Whatever is wrong with a file or an
 argument is one line on standard error and exit status 2; output files are written whole or not at all.
@@ -18,6 +18,7 @@ from torchdls.cli.demo import add_demo
 from torchdls.cli.integrate import add_integrate
 from torchdls.cli.methods import list_methods
 from torchdls.cli.photometric import add_photometric
+from torchdls.cli.pictures import add_view
 
 _EXAMPLES = """\
 examples:
@@ -25,6 +26,8 @@ examples:
   torchdls integrate normals.png --convention directx --mask mask.png -o surface.ply -o height.tiff
   torchdls integrate gradient.npz --method least_squares -o height.npz
   torchdls integrate normals.png --convention opencv --camera K.txt -o depth.tiff
+  torchdls integrate FOLDER -o surface.npz -o view.html -o preview.png
+  torchdls view surface.npz
   torchdls photometric photographs --normals normals.png -o surface.ply
   torchdls batch maps/ --out surfaces --format npz,ply --convention directx
 """
@@ -82,6 +85,7 @@ def _parser() -> argparse.ArgumentParser:
     add_integrate(commands)
     add_photometric(commands)
     add_batch(commands)
+    add_view(commands)
     add_demo(commands)
     methods = commands.add_parser("methods", help="list the methods", description="List the methods and their options.")
     methods.set_defaults(run=list_methods)

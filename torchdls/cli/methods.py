@@ -108,10 +108,7 @@ def _bar(label: str, method: Integrator, quiet: bool) -> Iterator[Any]:
         yield step
 
 
-def run_method(
-    label: str, method: Integrator, quiet: bool, gradient: Tensor, **fields: Tensor | None
-) -> tuple[Tensor, Tensor | None]:
-    """The height, and the noise level if the method found one."""
+def run_method(label: str, method: Integrator, quiet: bool, gradient: Tensor, **fields: Tensor | None) -> Any:
+    """What `solve` of the method returns, with a progress bar."""
     with _bar(label, method, quiet) as step:
-        result = method.solve(gradient, **fields, callback=step)
-    return result.height, result._asdict().get("noise")
+        return method.solve(gradient, **fields, callback=step)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchdls._registry import INTEGRATORS, PHOTOMETRIC
 from torchdls.cli.methods import build_method, check_method, run_method
+from torchdls.cli.pictures import OUTPUTS, Shown, check_outputs, is_picture, maps_of, write_picture
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -29,8 +30,7 @@ def add_photometric(commands: Any) -> None:
     )
     add = command.add_argument
     add("folder", metavar="FOLDER", help="the folder with the pictures")
-    add("-o", "--out", action="append", default=[], metavar="OUT",
-        help="the surface: NPZ, NPY, TIFF (32-bit), PNG (16-bit), PLY, OBJ, STL or GLB; may be repeated")  # fmt: skip
+    add("-o", "--out", action="append", default=[], metavar="OUT", help=f"the surface: {OUTPUTS}")
     add("--normals", metavar="OUT", help="the normal map: PNG (16-bit), NPY or NPZ")
     add("--method", default=_METHOD, help=f"{', '.join(PHOTOMETRIC)} (default: {_METHOD})")
     add("--integrator", default=_INTEGRATOR, help=f"{', '.join(INTEGRATORS)} (default: {_INTEGRATOR})")
@@ -39,6 +39,7 @@ def add_photometric(commands: Any) -> None:
     add("--refine", action="store_true", help="polish the surface by the images themselves")
     add("--lights", metavar="FILE", help="directions of the lights, in place of the folder's own")
     add("--pixel-size", type=float, default=1.0, metavar="D", help="spacing of the pixels")
+    add("--unit", metavar="NAME", help="unit of the heights, for the labels of pictures, such as mm")
     add("--force", action="store_true", help="replace output files that exist")
     add("--quiet", action="store_true", help="no progress bar and no report")
     command.set_defaults(run=_photometric)
@@ -57,8 +58,7 @@ def _photometric(arguments: argparse.Namespace) -> None:
     if not arguments.pixel_size > 0:
         raise ValueError(f"--pixel-size: {arguments.pixel_size} given, a positive number is needed")
     check_method(arguments.integrator, arguments.set, "--integrator")
-    for path in arguments.out:
-        check_output(path, arguments.force, suffixes=io.OUTPUT_SUFFIXES)
+    check_outputs(arguments.out, arguments.force)
     if arguments.normals is not None:
         check_output(arguments.normals, arguments.force, suffixes=io.NORMAL_SUFFIXES)
     start = time.perf_counter()
@@ -112,11 +112,18 @@ def _surface(arguments: argparse.Namespace, images: Tensor, lights: Tensor, mask
     method = build_method(arguments.integrator, size, arguments.set, "--integrator")
     weight = found.confidence if arguments.weigh else None
     label = Path(arguments.folder).name
-    height, _ = run_method(label, method, arguments.quiet, field.gradient, mask=inside, weight=weight)
+    result = run_method(label, method, arguments.quiet, field.gradient, mask=inside, weight=weight)
+    height, maps = result.height, maps_of(result, inside, weight)
     if arguments.refine:
         height = refine(height, images, lights, mask=inside, pixel_size=size).height
     for path in arguments.out:
-        io.save_height(
-            path, height, mask=inside, pixel_size=size, overwrite=arguments.force,
-            normals=found.normals[0], albedo=found.albedo[0, 0],
-        )  # fmt: skip
+        if is_picture(path):
+            shown = Shown(height, inside, size, field.gradient, **maps)
+            title = f"{label}, {arguments.method}, {arguments.integrator}"
+            write_picture(path, shown, title=title, unit=arguments.unit, overwrite=arguments.force)
+        else:
+            io.save_height(
+                path, height, mask=inside, pixel_size=size, overwrite=arguments.force,
+                normals=found.normals[0], albedo=found.albedo[0, 0], gradient=field.gradient[0],
+                **{name: maps[name][0] for name in maps},
+            )  # fmt: skip
