@@ -29,7 +29,7 @@ BENCH_SCRIPTS := $(filter-out $(BENCH_TESTS),$(wildcard benchmarks/speed/*.py be
 SMOKE_SIZES := not 512 and not 1024 and not 2048 and not 64-64
 NOTEBOOKS := $(patsubst notebooks/%.py,%,$(wildcard notebooks/*.py))
 
-.PHONY: help demo test test-slow fuzz docs lint format types notebooks notebooks-update picture bench-smoke check check-rest clean
+.PHONY: help demo test test-slow fuzz docs lint format types notebooks notebooks-update picture pictures bench-smoke check check-rest clean
 .DELETE_ON_ERROR:
 
 help:
@@ -74,6 +74,10 @@ notebooks-update: notebooks
 picture: demo
 	$(BIN)/python -c "from PIL import Image; p = Image.open('$(DEMO)/terrain.png').convert('RGB'); \
 	p.resize((900, p.height * 900 // p.width), Image.Resampling.LANCZOS).quantize(256).save('docs/demo.png', optimize=True)"
+
+# The pictures of the guide, into docs/pictures.
+pictures: $(VENV)/.dev
+	$(BIN)/python -m docs.pictures
 
 # The site, into build/site; a broken link or name stops it.
 docs: $(VENV)/.dev

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from tests.cli.test_cli import fails, surface
-from torchdls import gradient_to_normals, load_height, save_normals
+from torchdls import depth_to_points, gradient_to_normals, load_height, save_normals
 from torchdls.cli import pictures
 from torchdls.cli.main import main
 
@@ -63,6 +63,19 @@ def test_view_shows_depths_as_points_and_jumps(tmp_path, gradient_file):
     assert "height (geometric mean 1)" in (tmp_path / "d.html").read_text()
     run("integrate", gradient_file, "--method", "piecewise", "--quiet", "-o", tmp_path / "p.npz")
     assert pictures.read_shown(str(tmp_path / "p.npz")).jump.shape == (1, 2, 24, 24)
+
+
+def test_only_what_the_mask_fills_is_shown():
+    """Under a camera the points stay where they are."""
+    depth, mask = torch.rand(1, 1, 9, 12) + 1, torch.zeros(1, 1, 9, 12, dtype=torch.bool)
+    mask[..., 3:5, 0:4] = True
+    camera = torch.tensor([[20.0, 0, 6], [0, 20, 4], [0, 0, 1]])
+    gradient = torch.rand(1, 2, 9, 12)
+    part = pictures._cropped(pictures.Shown(depth, mask, (1.0, 1.0), gradient, camera=camera))
+    assert part.gradient.equal(gradient[..., 2:6, :5])
+    assert part.mask.sum() == mask.sum()
+    points = depth_to_points(depth, camera)[..., 2:6, :5]
+    torch.testing.assert_close(depth_to_points(part.height, part.camera), points)
 
 
 def test_view_opens_a_page(tmp_path, gradient_file, monkeypatch, capsys):

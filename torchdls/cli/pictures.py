@@ -51,7 +51,7 @@ def write_picture(path: str, shown: Shown, *, title: str, unit: str | None, over
     from torchdls._files import atomic_file
     from torchdls.geometry import depth_to_points
 
-    height, mask, pixel_size, gradient, trust, jump, camera = shown
+    height, mask, pixel_size, gradient, trust, jump, camera = _cropped(shown)
     if unit is None:
         unit = "geometric mean 1" if camera is not None else "px" if pixel_size == (1.0, 1.0) else "unit of pixel size"
     if path.lower().endswith(".html"):
@@ -66,6 +66,24 @@ def write_picture(path: str, shown: Shown, *, title: str, unit: str | None, over
         content = plot.png_bytes(figure)
     with atomic_file(path, overwrite) as file:
         file.write(content)
+
+
+def _cropped(shown: Shown) -> Shown:
+    """Only the rectangle that the mask fills, with a pixel around it."""
+    if shown.mask is None:
+        return shown
+    rows, columns = shown.mask[0, 0].nonzero(as_tuple=True)
+    top, left = (max(int(places.min()) - 1, 0) for places in (rows, columns))
+    box = (..., slice(top, int(rows.max()) + 2), slice(left, int(columns.max()) + 2))
+    camera = shown.camera
+    if camera is not None:
+        camera = camera.clone()
+        camera[0, 2] -= left
+        camera[1, 2] -= top
+    fields = {name: getattr(shown, name) for name in ("height", "mask", "gradient", "trust", "jump")}
+    return Shown(
+        pixel_size=shown.pixel_size, camera=camera, **{n: None if f is None else f[box] for n, f in fields.items()}
+    )
 
 
 def maps_of(result: Any, mask: Tensor | None, weight: Tensor | None) -> dict[str, Any]:
