@@ -44,6 +44,7 @@ OPERATOR, PATCHES = torchdls.GradientOperator(), torchdls.Patches(4, 2)
 # How each is called; the tensors among these arguments are what is replaced. Public functions are called by name.
 CALLS = {
     "add_noise": {"gradient": field(2), "snr_db": 10.0, "mask": mask()},
+    "backends": {},
     "bivariate_normals": PHOTOMETRIC | {"n_iter": 2},
     "cast_shadows": {"height": field(1), "lights": lights()},
     "compare_heights": {"truth": field(1), "heights": {"height": field(1)}, "mask": mask(), "gradient": field(2),

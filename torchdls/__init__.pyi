@@ -11,6 +11,7 @@ from .dictionary import Focuss as Focuss
 from .dictionary import Learner as Learner
 from .dictionary import SoupDIL as SoupDIL
 from .dictionary import Unitary as Unitary
+from .dictionary import backends as backends
 from .dictionary import dct_dictionary as dct_dictionary
 from .dictionary import denoise_height as denoise_height
 from .dictionary import orthogonal_matching_pursuit as orthogonal_matching_pursuit

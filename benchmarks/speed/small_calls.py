@@ -1,26 +1,29 @@
 """LeastSquares from 16^2 to 2048^2 beside SciPy in the same precision, and sweeps of patches as `unfold` lays them out.
 
 `python -m benchmarks.speed.small_calls` (two minutes; add --smoke). One thread; candidates take turns in one process,
-and medians are compared. "Solve alone" is what is left of a call without `nn.Module` and the checks of what comes in
-and goes out. Writes JSON and Markdown.
+and medians of its processor time are compared. "Solve alone" is what is left of a call without `nn.Module` and the
+checks of what comes in and goes out. Writes JSON and Markdown.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable
 from statistics import median
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-from benchmarks.common.peers import ScipyPoisson
+from benchmarks.common.peers import ScipyPoisson, optional
 from benchmarks.common.report import made_by, markdown_table, results_folder, write_json
 from benchmarks.common.timing import interleaved
 from benchmarks.speed.compare import noisy
-from torchdls import DLS, LeastSquares, SoupDIL, soup_dil_sweep
+from torchdls import DLS, LeastSquares, SoupDIL, backends, soup_dil_sweep
+from torchdls.dictionary import sweep_fused
 from torchdls.dictionary.soup_dil import Order, residual_sweep
 from torchdls.solvers import integrate_direct
 
@@ -29,7 +32,9 @@ SIZES = (16, 32, 64, 96, 128, 256, 512, 1024, 2048)
 
 def medians(candidates: dict[str, Callable[[], Any]], seconds: float) -> dict[str, float]:
     """Microseconds of each."""
-    return {name: 1e6 * median(times) for name, times in interleaved(candidates, seconds).items()}
+    return {
+        name: 1e6 * median(times) for name, times in interleaved(candidates, seconds, clock=time.process_time).items()
+    }
 
 
 def least_squares(size: int, dtype: torch.dtype, seconds: float) -> dict[str, Any]:
@@ -53,19 +58,26 @@ def sweep(size: int, order: Order, seconds: float) -> dict[str, Any]:
     together = apart.mT.contiguous().mT
     R, codes, product = (together.mT - B.mT @ D.mT).mT, B.clone(), torch.empty_like(B)
     candidates: dict[str, Callable[[], Any]] = {
-        "residual apart": lambda: _as_before(apart, D, B, mu, order),
-        "unfold": lambda: soup_dil_sweep(apart, D, B, mu, order=order),
-        "contiguous": lambda: soup_dil_sweep(together, D, B, mu, order=order),
-        "in place": lambda: residual_sweep(R, D, codes, mu, order=order),
+        "unfold": lambda: _alone(soup_dil_sweep, apart, D, B, mu, order=order),
+        "in place": lambda: _alone(residual_sweep, R, D, codes, mu, order=order),
         "product": lambda: torch.bmm(D.mT, R, out=product),
     }
+    if backends()["soup_dil_sweep"] == "numba":
+        S, _, own = residual_sweep(R.clone(), D, codes.clone(), mu, order=order)
+        candidates["unfold, loops"] = lambda: soup_dil_sweep(apart, D, B, mu, order=order)
+        candidates["in place, loops"] = lambda: residual_sweep(S, D, own, mu, order=order)
+    if spams := optional("spams"):
+        X, A, level = (np.asfortranarray(x[0].numpy()) for x in (apart, D, mu))
+        candidates["SPAMS OMP"] = lambda: spams.omp(X, A, lambda1=float(level[0]) ** 2 / 2, numThreads=1)
     times = medians(candidates, seconds)
-    return {"size": size, "order": order, **{name: t / times["product"] for name, t in times.items()}}
+    in_products = {name: t / times["product"] for name, t in times.items()}
+    return {"size": size, "order": order, "product, us": times["product"], **in_products}
 
 
-def _as_before(P: torch.Tensor, D: torch.Tensor, B: torch.Tensor, mu: torch.Tensor, order: Order) -> Any:
-    """The sweep with its residual laid out as the patches are."""
-    return residual_sweep((P.mT - B.mT @ D.mT).mT, D, B.clone(), mu, order=order)
+def _alone(sweep: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    """By PyTorch alone."""
+    with patch.object(sweep_fused, "installed", lambda: False):
+        return sweep(*args, **options)
 
 
 def table(rows: list[dict[str, Any]], sweeps: list[dict[str, Any]]) -> str:
@@ -75,15 +87,23 @@ def table(rows: list[dict[str, Any]], sweeps: list[dict[str, Any]]) -> str:
          f"{r['torchdls'] / r['SciPy']:.2f}", f"{r['solve alone'] / r['SciPy']:.2f}")
         for r in rows
     ]  # fmt: skip
-    names = ("residual apart", "unfold", "contiguous", "in place")
-    below = [(f"{s['size']}^2", s["order"], *(f"{s[name]:.1f}" for name in names)) for s in sweeps]
+    names = ("unfold", "in place", "unfold, loops", "in place, loops", "SPAMS OMP")
+    below = [
+        (f"{s['size']}^2", s["order"], f"{s['product, us'] / 1e3:.2f}", *(_products(s.get(name)) for name in names))
+        for s in sweeps
+    ]
     made = made_by("benchmarks.speed.small_calls")
     return (
         f"LeastSquares beside SciPy's cosine transforms, one thread:\n\n{markdown_table(header, lines)}\n{made}\n"
-        "A sweep, in products of the dictionary with all codes: with the residual laid out as `unfold` lays out its\n"
-        "patches (as before), from `unfold`, from contiguous patches, and in place as DLS runs it:\n\n"
-        f"{markdown_table(('size', 'order', *names), below)}\n{made}"
+        "A sweep, in products of the dictionary with all codes: from the patches that `unfold` gives and in place as\n"
+        "DLS runs it, by PyTorch alone and by compiled loops (the extra `fast`); beside it the orthogonal matching\n"
+        "pursuit of SPAMS at the same threshold, which only codes:\n\n"
+        f"{markdown_table(('size', 'order', 'product, ms', *names), below)}\n{made}"
     )
+
+
+def _products(times: float | None) -> str:
+    return "-" if times is None else f"{times:.1f}"
 
 
 def main() -> None:

@@ -26,6 +26,7 @@ def objective(P, D, B, mu):
     return float((P - D @ B).square().sum() + (level.square() * (B != 0)).sum())
 
 
+@pytest.mark.usefixtures("sweep_by")
 @pytest.mark.parametrize("K", [1, 5, 8, 17])
 @pytest.mark.parametrize("unused", ["first", "keep"])
 @pytest.mark.parametrize("bound", [math.inf, 1.2])
@@ -46,6 +47,7 @@ def test_sweep_is_the_papers(order, bound, unused, K):
         assert (B[:, -1] == 0).all(), "the case of an unused atom occurs"
 
 
+@pytest.mark.usefixtures("sweep_by")
 @pytest.mark.parametrize("dtype, atol", [(torch.float32, 1e-4), (torch.float64, 1e-9)], ids=str)
 @pytest.mark.parametrize("order", ["atom", "block"])
 def test_sparse_batches_are_the_papers(order, dtype, atol):
@@ -63,6 +65,7 @@ def test_sparse_batches_are_the_papers(order, dtype, atol):
         np.testing.assert_allclose(B_new[i].numpy(), expected[1], atol=10 * atol)
 
 
+@pytest.mark.usefixtures("sweep_by")
 @pytest.mark.parametrize("surface", ["tent", "peaks"])
 @pytest.mark.parametrize("order", ["atom", "block"])
 def test_float32_is_accurate_on_patches_of_surfaces(order, surface):
@@ -82,6 +85,7 @@ def test_float32_is_accurate_on_patches_of_surfaces(order, surface):
     assert objective(P, rounded[0].double(), rounded[1].double(), 0.3) == pytest.approx(objective(P, *exact, 0.3), 1e-6)
 
 
+@pytest.mark.usefixtures("sweep_by")
 @pytest.mark.parametrize("order", ["atom", "block"])
 def test_fixed_dictionary_updates_the_codes_alone(order):
     P, D, B = problem()
@@ -95,6 +99,7 @@ def test_fixed_dictionary_updates_the_codes_alone(order):
             np.testing.assert_allclose(B_new[i].numpy(), expected[1], atol=1e-10)
 
 
+@pytest.mark.usefixtures("sweep_by")
 @pytest.mark.parametrize("order", ["atom", "block"])
 @pytest.mark.parametrize("per", ["number", "surface", "atom", "both"])
 def test_shared_dictionary_learns_from_all_patches(order, per):
@@ -112,6 +117,7 @@ def test_shared_dictionary_learns_from_all_patches(order, per):
     np.testing.assert_allclose(torch.cat(list(B_new), -1).numpy(), expected[1], atol=1e-9)
 
 
+@pytest.mark.usefixtures("sweep_by")
 def test_thresholds_of_every_shape():
     P, D, B = problem(N=2)
     number = soup_dil_sweep(P, D, B, 0.8)[1]
@@ -125,6 +131,7 @@ def test_thresholds_of_every_shape():
         )
 
 
+@pytest.mark.usefixtures("sweep_by")
 @pytest.mark.parametrize("learn", [True, False])
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("bound", [math.inf, 2.0, 0.4])
@@ -161,6 +168,7 @@ def test_hard_threshold_by_brute_force():
     assert (shrink(edge, level) != 0).tolist() == [False, False, True, True]
 
 
+@pytest.mark.usefixtures("sweep_by")
 def test_float32_keeps_up_with_float64():
     """Large patches, small details: nothing cancels."""
     P, D, B = problem(n=16, K=24, L=500)
@@ -174,6 +182,7 @@ def test_float32_keeps_up_with_float64():
         torch.testing.assert_close(costs[1], costs[0], rtol=1e-3, atol=0)
 
 
+@pytest.mark.usefixtures("sweep_by")
 @pytest.mark.parametrize("order", ["atom", "block"])
 def test_the_layout_of_the_patches_makes_no_difference(order):
     """`unfold` puts the pixels of a patch far apart; the sweep works on a residual that has them side by side."""
@@ -187,6 +196,7 @@ def test_the_layout_of_the_patches_makes_no_difference(order):
         assert torch.equal(one, other)
 
 
+@pytest.mark.usefixtures("sweep_by")
 def test_arguments_are_left_alone():
     P, D, B = problem()
     mu = torch.full((9,), 0.5, dtype=P.dtype)

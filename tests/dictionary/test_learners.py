@@ -111,6 +111,7 @@ ALL = [SoupDIL(), SoupDIL("block", "keep"), KSVD(), KSVD(n_nonzero=3, steps=3), 
        DinoKat(2, (3, 4), "block"), Focuss(), Focuss(1.0, 2)]  # fmt: skip
 
 
+@pytest.mark.usefixtures("sweep_by")
 @pytest.mark.parametrize("learner", ALL, ids=repr)
 @pytest.mark.parametrize("shared", [False, True])
 def test_no_pass_raises_the_cost(learner, shared):
@@ -139,6 +140,7 @@ def test_no_pass_raises_the_cost(learner, shared):
         torch.testing.assert_close(alone[2], B[1:], atol=1e-8, rtol=1e-8)
 
 
+@pytest.mark.usefixtures("sweep_by")
 @pytest.mark.parametrize("learner", [*ALL[:5], Focuss()], ids=repr)
 def test_learn_false_keeps_the_dictionary(learner):
     P, D = random_field(1, 9, 30), unit(random_field(1, 9, 12, seed=2))

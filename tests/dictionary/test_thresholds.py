@@ -39,6 +39,7 @@ def test_firm_lies_between_hard_and_soft_and_is_continuous() -> None:
     assert firm.diff().abs().max() < 2.1 * X.diff()[0]
 
 
+@pytest.mark.usefixtures("sweep_by")
 @pytest.mark.parametrize("order", ["atom", "block"])
 @pytest.mark.parametrize("rule", THRESHOLDS)
 def test_sweep_never_raises_its_objective(rule: str, order: str, generator: torch.Generator) -> None:

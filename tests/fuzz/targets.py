@@ -199,6 +199,7 @@ ELSEWHERE = {
     "SURFACES": "sample", "save_height": "write_height", "load_height": "write_height", "save_mesh": "write_mesh",
     "load_field": "write_field", "load_camera": "camera_file", "load_mask": "mask_file", "save": "keep",
     "load": "keep", "build": "keep", "ring_of_lights": "woodham", "solve": "solve", "add_noise": "add_noise",
+    "backends": "torchdls.soup_dil_sweep",
     "GradientToNormals": "gradient_to_normals", "NormalsToGradient": "normals_to_gradient", "page_html": "surface_page",
     "terrain": "no argument but a size; tests/test_surfaces.py", "Learner": "a protocol", "Integrator": "abstract",
     "Exact": "an option of DLS", "Implicit": "an option of DLS", "Proximal": "an option of DLS",

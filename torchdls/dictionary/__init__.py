@@ -7,6 +7,7 @@ from torchdls.dictionary.initial import dct_dictionary
 from torchdls.dictionary.learners import KSVD, DinoKat, FixedDictionary, Learner, SoupDIL
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import soup_dil_sweep
+from torchdls.dictionary.sweep_fused import backends
 from torchdls.dictionary.unitary import Unitary
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "Learner",
     "SoupDIL",
     "Unitary",
+    "backends",
     "dct_dictionary",
     "denoise_height",
     "orthogonal_matching_pursuit",

@@ -14,7 +14,8 @@ from torch import Tensor
 from torchdls._checks import check_alike, check_real
 from torchdls._precision import full_precision
 from torchdls._tracing import is_recorded
-from torchdls.dictionary.thresholds import THRESHOLDS, Threshold, shrink
+from torchdls.dictionary import sweep_fused
+from torchdls.dictionary.thresholds import THRESHOLDS, Threshold, cut, shrink
 
 Order = Literal["atom", "block"]
 Unused = Literal["first", "keep"]
@@ -85,6 +86,11 @@ def soup_dil_sweep(
     """
     _check(P, D, B, order, unused, threshold)
     _check_levels(mu, bound, B)
+    if _is_fused(P, D, B, mu):
+        cuts = _cuts(mu, bound, threshold, B)
+        how: dict[str, bool] = {"keep": unused == "keep", "atom_order": order == "atom", "learn": learn}
+        _, D, B = sweep_fused.sweep(P, D, B, cuts, bound, threshold, patches=True, **how)
+        return D, B
     # Each patch contiguous in memory, whatever the layout of P (`unfold` puts its pixels far apart).
     R = torch.baddbmm(P.mT, B.mT, D.mT.expand(P.shape[0], -1, -1), alpha=-1).mT
     B = B if is_recorded(R, D, B) else B.clone()
@@ -114,6 +120,10 @@ def residual_sweep(
     Returns:
         R, D and B after the sweep. Where no derivative is recorded, R and B are overwritten: no second copy is made.
     """
+    if project is None and _is_fused(R, D, B, mu):
+        cuts = _cuts(mu, bound, threshold, B)
+        how: dict[str, bool] = {"keep": unused == "keep", "atom_order": order == "atom", "learn": learn}
+        return sweep_fused.sweep(R, D, B, cuts, bound, threshold, **how)
     in_place = not is_recorded(R, D, B, *([mu] if isinstance(mu, Tensor) else []))
     rule = _Rule(_levels(mu, B, in_place), bound, threshold, unused, in_place, project)
     if not in_place or R.shape[-1] < _SHORTEST or (learn and D.shape[0] < R.shape[0]):
@@ -281,6 +291,18 @@ def _where_used(atoms: Tensor, D: Tensor, unused: Unused) -> Tensor:
         instead = torch.zeros_like(D)
         instead[:, 0] = 1
     return torch.where((atoms != 0).any(1, keepdim=True), atoms, instead)
+
+
+def _is_fused(R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor) -> bool:
+    """Whether the compiled loops do the sweep."""
+    return sweep_fused.serves(R) and not is_recorded(R, D, B, *([mu] if isinstance(mu, Tensor) else []))
+
+
+def _cuts(mu: float | Tensor, bound: float, threshold: Threshold, B: Tensor) -> Tensor:
+    """(N or 1, K), up to where each code is cut."""
+    mu = torch.as_tensor(mu, dtype=B.dtype, device=B.device)
+    mu = mu if mu.ndim == 2 else mu.reshape(1, -1)
+    return torch.as_tensor(cut(mu, bound) if threshold == "hard" else mu).expand(-1, B.shape[1])
 
 
 def _levels(mu: float | Tensor, B: Tensor, look: bool) -> Sequence[float | Tensor]:

@@ -29,8 +29,8 @@ _AT_ONCE = 2**20
 def shrink(x: Tensor, mu: float | Tensor, bound: float = math.inf, rule: Threshold = "hard") -> Tensor:
     """Minimiser b of (b - x)^2 + penalty(b) over [-bound, bound]; 0 where |x| = mu. Shapes broadcast."""
     if rule == "hard":
-        cut = _cut(mu, bound)
-        b = torch.hardshrink(x, cut) if isinstance(cut, float) else torch.where(x.abs() > cut, x, 0)
+        edge = cut(mu, bound)
+        b = torch.hardshrink(x, edge) if isinstance(edge, float) else torch.where(x.abs() > edge, x, 0)
     else:
         size = x.abs()
         rest = torch.where(size > mu, x.sign() * (size - mu), 0)
@@ -38,7 +38,7 @@ def shrink(x: Tensor, mu: float | Tensor, bound: float = math.inf, rule: Thresho
     return b if math.isinf(bound) else b.clamp(-bound, bound)
 
 
-def _cut(mu: float | Tensor, bound: float) -> float | Tensor:
+def cut(mu: float | Tensor, bound: float) -> float | Tensor:
     """Up to where a code is cut: mu, but beyond a bound below mu a clipped code must still save mu^2.
 
     There x^2 - (x - bound)^2 > mu^2.

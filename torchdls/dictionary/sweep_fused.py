@@ -1,0 +1,200 @@
+"""A sweep of SOUP-DIL by compiled loops (the extra `fast`), where nothing is recorded and the tensors are on the CPU.
+
+It does what `soup_dil` does, without what is 0: one dense product D^T R, then patch by patch only the atoms that a
+patch uses or used. Rounding differs, so a code that is within it of the threshold may be kept in one and not in the
+other.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchdls.dictionary.thresholds import THRESHOLDS, Threshold
+
+_CHUNK = 2048  # patches of one thread that are worked on at a time: they stay in the cache
+_GROUP = 16  # atoms of the paper's order that share one product with the residual
+
+
+@functools.cache
+def installed() -> bool:
+    """Whether there is a Numba."""
+    return find_spec("numba") is not None
+
+
+def backends() -> dict[str, str]:
+    """What does the work where there is a choice, by the name of the function.
+
+    The compiled loops of the extra `fast` serve on the CPU where no derivative is recorded, by themselves; everywhere
+    else, and without Numba, PyTorch does.
+
+    Returns:
+        "numba" or "torch" for `soup_dil_sweep`, and so for `DLS`.
+
+    Example:
+        >>> torchdls.backends()["soup_dil_sweep"] in ("numba", "torch")
+        True
+    """
+    return {"soup_dil_sweep": "numba" if installed() else "torch"}
+
+
+def serves(*tensors: Tensor) -> bool:
+    """Whether the loops can be had for tensors that are not recorded."""
+    return installed() and all(t.device.type == "cpu" for t in tensors)
+
+
+def _loops() -> ModuleType:
+    """Loaded when first used: Numba takes half a second."""
+    from torchdls.dictionary import sweep_loops
+
+    return sweep_loops
+
+
+class _How(NamedTuple):
+    """The options of a sweep, as the loops take them."""
+
+    bound: Any
+    rule: int
+    keep: bool
+    learn: bool
+    patches: bool
+
+
+def sweep(
+    R: Tensor,
+    D: Tensor,
+    B: Tensor,
+    cut: Tensor,
+    bound: float = math.inf,
+    threshold: Threshold = "hard",
+    keep: bool = False,
+    *,
+    atom_order: bool = True,
+    learn: bool = True,
+    patches: bool = False,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One sweep, see `soup_dil_sweep`; R and B are overwritten where they lie as the loops need them.
+
+    So they do when they come from a sweep before: then patches are contiguous in R, and in B rows in the order of the
+    paper, patches otherwise.
+
+    Args:
+        R: (N, n, L) residual, or with `patches` the patches, which stay as they are.
+        D: (N, n, K), or (1, n, K) shared.
+        B: (N, K, L).
+        cut: (N or 1, K), up to where a code is cut.
+        bound: of the codes.
+        threshold: "hard", "soft" or "firm".
+        keep: unused atoms stay as they are.
+        atom_order: row, atom, row, atom; or all rows and then all atoms.
+        learn: False keeps D.
+        patches: R is given as patches, and the residual afterwards is not asked for.
+
+    Returns:
+        R (with `patches`, whatever it was used for), D and B.
+    """
+    R, D, B = R.detach(), D.detach(), B.detach()
+    by_atom, rowwise = atom_order and learn, torch.contiguous_format
+    codes = B if by_atom else B.mT
+    codes = codes.clone(memory_format=rowwise) if patches else codes.contiguous()
+    if not patches:
+        rows = R.mT.contiguous()
+    else:
+        rows = torch.baddbmm(R.mT, B.mT, D.mT.expand(len(R), -1, -1), alpha=-1) if by_atom else R.mT
+    cut = cut.to(B).expand(len(B), -1).contiguous()
+    how = _How(B.new_tensor(bound).numpy()[()], THRESHOLDS.index(threshold), keep, learn, patches)
+    step, new = _atom_order if by_atom else _block_order, []
+    alone = len(D) == 1 and learn and len(R) > 1
+    for i in (slice(None),) if alone else (slice(k, k + 1) for k in range(len(R))):
+        new.append(step(rows[i], D[0 if len(D) == 1 else i.start], codes[i], cut[i], how))
+    return rows.mT, torch.stack(new) if learn else D, codes if by_atom else codes.mT
+
+
+def _block_order(R: Tensor, D: Tensor, codes: Tensor, cut: Tensor, how: _How) -> Tensor:
+    """All codes, then all atoms, of surfaces (m, L, n) and (m, L, K) with one dictionary (n, K), which comes back."""
+    loops, (n, K), length = _loops(), D.shape, _CHUNK * torch.get_num_threads()
+    atoms = D.mT.contiguous()
+    moves = torch.cat([(atoms @ D).triu(1), atoms], 1).numpy()
+    H, C = (torch.zeros(K, k, dtype=torch.float64) for k in (n, K))
+    Q, room = codes.new_empty(min(length, R.shape[1]), K), R.new_empty(min(length, R.shape[1]) if how.patches else 0, n)
+    used, counts = (torch.empty(shape, dtype=torch.int16) for shape in (codes.shape, codes.shape[:2]))
+
+    def update(level: Any, r: Tensor, q: Tensor, b: Tensor, u: Tensor, many: Tensor) -> tuple[Tensor, Tensor]:
+        h, c = R.new_zeros(K, n), R.new_zeros(K, K)
+        given = (x.numpy() for x in (r, q, b, u.view(-1), many))
+        loops.update_codes(*given, moves, level, how.bound, how.rule, h.numpy(), c.numpy())
+        return h, c
+
+    with _Workers() as workers:
+        for i, part in _chunks(R, length):
+            r, b = R[i, part], codes[i, part]
+            if how.patches:
+                r = room[: len(r)].copy_(r)
+                workers(lambda x, c: loops.subtract(x.numpy(), c.numpy(), atoms.numpy()), r, b)
+            q = torch.mm(r, D, out=Q[: len(r)])
+            level = cut[i].numpy()
+            for h, c in workers(functools.partial(update, level), r, q, b, used[i, part], counts[i, part]):
+                H += h
+                C += c
+        if not how.learn:
+            return D
+        new = torch.empty_like(atoms)
+        loops.update_atoms(H.numpy(), C.numpy(), atoms.numpy(), how.keep, new.numpy())
+        step = (new - atoms).numpy()
+
+        def follow(r: Tensor, b: Tensor, u: Tensor, many: Tensor) -> None:
+            loops.subtract_used(r.numpy(), b.numpy(), u.view(-1).numpy(), many.numpy(), step)
+
+        for i, part in () if how.patches else _chunks(R, length):
+            workers(follow, *(x[i, part] for x in (R, codes, used, counts)))
+    return new.mT
+
+
+def _atom_order(R: Tensor, D: Tensor, codes: Tensor, cut: Tensor, how: _How) -> Tensor:
+    """Row, atom, row, atom, .. for surfaces (m, L, n) and (m, K, L) with one dictionary (n, K), which comes back."""
+    loops, rows, atoms = _loops(), R.flatten(0, 1), D.mT.contiguous()
+    new, count = torch.empty_like(atoms), len(rows)
+    Q, (before, after) = R.new_empty(_GROUP, count), R.new_empty(2, count)
+    where = torch.empty(count + 1, dtype=torch.int64)
+    for start in range(0, len(atoms), _GROUP):
+        group = atoms[start : start + _GROUP]
+        q = torch.mm(group, rows.mT, out=Q[: len(group)])
+        loops.update_group(
+            rows.numpy(), q.numpy(), codes.numpy(), atoms.numpy(), start, cut.numpy(), how.bound, how.rule, how.keep,
+            new.numpy(), where.numpy(), before.numpy(), after.numpy(),
+        )  # fmt: skip
+    return new.mT
+
+
+def _chunks(R: Tensor, length: int) -> Iterator[tuple[int, slice]]:
+    """Surface and patches, as many as all threads take at a time."""
+    return ((i, slice(k, k + length)) for i in range(R.shape[0]) for k in range(0, R.shape[1], length))
+
+
+class _Workers:
+    """Calls a function for parts of some tensors at the same time, on as many threads as PyTorch may use."""
+
+    def __init__(self) -> None:
+        self._count = torch.get_num_threads()
+        self._pool = ThreadPoolExecutor(self._count) if self._count > 1 else None
+
+    def __enter__(self) -> _Workers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    def __call__(self, f: Callable[..., Any], *tensors: Tensor) -> list[Any]:
+        if self._pool is None:
+            return [f(*tensors)]
+        step = -(-len(tensors[0]) // self._count)
+        return list(self._pool.map(f, *(x.split(step) for x in tensors)))
