@@ -1,15 +1,20 @@
 import pytest
 
 from torchdls import backends
-from torchdls.dictionary import sweep_fused
+from torchdls.dictionary import soup_dil, sweep_chunks, sweep_fused
 
 
-@pytest.fixture(params=["torch", "numba"])
+@pytest.fixture(params=["torch", "chunks", "numba"])
 def sweep_by(request, monkeypatch):
-    """The sweep by PyTorch alone, and by the compiled loops."""
-    if request.param == "torch":
-        monkeypatch.setattr(sweep_fused, "installed", lambda: False)
-    elif not sweep_fused.installed():
-        pytest.skip("Numba is not installed (the extra `fast`)")
-    assert backends() == {"soup_dil_sweep": request.param}
-    return request.param
+    """The sweep by PyTorch, of a batch together and of surfaces one by one in small chunks; and by compiled loops."""
+    if request.param == "numba":
+        if not sweep_fused.installed():
+            pytest.skip("Numba is not installed (the extra `fast`)")
+        assert backends() == {"soup_dil_sweep": "numba"}
+        return
+    monkeypatch.setattr(sweep_fused, "installed", lambda: False)
+    assert backends() == {"soup_dil_sweep": "torch"}
+    if request.param == "chunks":
+        monkeypatch.setattr(soup_dil, "_SHORTEST", 1)
+        monkeypatch.setattr(sweep_chunks, "_CHUNK", 7)
+        monkeypatch.setattr(sweep_chunks, "_FEW", 2)

@@ -52,7 +52,8 @@ def test_sweep(order, total, monkeypatch):
         residual_sweep(R, D, B, 0.2, order=order)
     assert seen.count.total() < total
     assert seen.large.total() <= 8  # updates of the residual in place, and no copy of it
-    assert not any(seen.large[name] for name in ("clone", "copy_", "cat", "_to_copy"))
+    assert seen.large["copy_"] == (order == "block")  # the codes, where they were
+    assert not any(seen.large[name] for name in ("clone", "cat", "_to_copy"))
 
 
 def test_least_squares_is_two_transforms():

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchdls._checks import check_alike, check_real
 from torchdls._precision import full_precision
 from torchdls._tracing import is_recorded
-from torchdls.dictionary import sweep_fused
+from torchdls.dictionary import sweep_chunks, sweep_fused
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold, cut, shrink
 
 Order = Literal["atom", "block"]
@@ -23,8 +23,8 @@ Unused = Literal["first", "keep"]
 # Atoms that share one product with the residual; inside such a group they are corrected for each other one by one.
 _GROUP = 16
 
-# Patches that the block order takes at once (over the whole batch), and the fewest of one surface: long enough that
-# the loop over the atoms costs little, short enough that its temporaries do.
+# Patches that the block order takes at once of a whole batch, and the fewest of one surface: long enough that the loop
+# over the atoms costs little, short enough that its temporaries do. From the fewest on, surfaces are swept one by one.
 _CHUNK, _SHORTEST = 65536, 4096
 
 
@@ -86,16 +86,8 @@ def soup_dil_sweep(
     """
     _check(P, D, B, order, unused, threshold)
     _check_levels(mu, bound, B)
-    if _is_fused(P, D, B, mu):
-        cuts = _cuts(mu, bound, threshold, B)
-        how: dict[str, bool] = {"keep": unused == "keep", "atom_order": order == "atom", "learn": learn}
-        _, D, B = sweep_fused.sweep(P, D, B, cuts, bound, threshold, patches=True, **how)
-        return D, B
-    # Each patch contiguous in memory, whatever the layout of P (`unfold` puts its pixels far apart).
-    R = torch.baddbmm(P.mT, B.mT, D.mT.expand(P.shape[0], -1, -1), alpha=-1).mT
-    B = B if is_recorded(R, D, B) else B.clone()
-    _, D, B = residual_sweep(R, D, B, mu, bound, order, unused=unused, learn=learn, threshold=threshold)
-    return D, B
+    rule = _Rule(mu, bound, threshold, unused)
+    return _swept(P, D, B, rule, order, learn, patches=True)[1:]
 
 
 @full_precision
@@ -120,35 +112,69 @@ def residual_sweep(
     Returns:
         R, D and B after the sweep. Where no derivative is recorded, R and B are overwritten: no second copy is made.
     """
-    if project is None and _is_fused(R, D, B, mu):
-        cuts = _cuts(mu, bound, threshold, B)
-        how: dict[str, bool] = {"keep": unused == "keep", "atom_order": order == "atom", "learn": learn}
-        return sweep_fused.sweep(R, D, B, cuts, bound, threshold, **how)
+    return _swept(R, D, B, _Rule(mu, bound, threshold, unused, project), order, learn, patches=False)
+
+
+def _swept(
+    R: Tensor, D: Tensor, B: Tensor, rule: _Rule, order: Order, learn: bool, patches: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The sweep by whoever does it fastest; with `patches`, R is P, and neither it nor B is written to."""
+    mu, by_atom = rule.mu, order == "atom" and learn
     in_place = not is_recorded(R, D, B, *([mu] if isinstance(mu, Tensor) else []))
-    rule = _Rule(_levels(mu, B, in_place), bound, threshold, unused, in_place, project)
-    if not in_place or R.shape[-1] < _SHORTEST or (learn and D.shape[0] < R.shape[0]):
-        return _sweep(R, D, B, rule, order, learn)
-    # Large surfaces one by one: each has thresholds that are numbers, and zeros that can be skipped.
+    if in_place and rule.project is None and sweep_fused.serves(R):
+        options = {"keep": rule.unused == "keep", "atom_order": by_atom, "learn": learn, "patches": patches}
+        return sweep_fused.sweep(R, D, B, rule.cuts(B), rule.bound, rule.threshold, **options)
+    rule = rule._replace(levels=_levels(mu, B, in_place), in_place=in_place)
+    alone = in_place and _is_alone(R, D, learn)
+    if patches:
+        B = B.clone() if in_place else B
+        if by_atom or not alone:
+            # Each patch contiguous in memory, whatever the layout of P (`unfold` puts its pixels far apart).
+            R = torch.baddbmm(R.mT, B.mT, D.mT.expand(R.shape[0], -1, -1), alpha=-1).mT
+    if not alone:
+        return _atom_order(R, D, B, rule) if by_atom else _block_order(R, D, B, rule, learn)
     dictionaries = []
     for i in range(R.shape[0]):
-        own = R[i : i + 1], D[i : i + 1] if len(D) > 1 else D, B[i : i + 1]
-        dictionaries.append(_sweep(*own, rule.of_surface(i), order, learn)[1])
+        own, one = (R[i : i + 1], D[i : i + 1] if len(D) > 1 else D, B[i : i + 1]), rule.of_surface(i)
+        found = _atom_order(*own, one)[1] if by_atom else _block_order_alone(*own, one, learn, patches)
+        dictionaries.append(found)
     return R, torch.cat(dictionaries) if learn else D, B
 
 
-def _sweep(R: Tensor, D: Tensor, B: Tensor, rule: _Rule, order: Order, learn: bool) -> tuple[Tensor, Tensor, Tensor]:
-    return _atom_order(R, D, B, rule) if order == "atom" and learn else _block_order(R, D, B, rule, learn)
+def _is_alone(R: Tensor, D: Tensor, learn: bool) -> bool:
+    """Whether surfaces are better swept one by one: each has thresholds that are numbers, and zeros to be skipped."""
+    together = R.shape[0] > 1 and (R.shape[-1] < _SHORTEST or (learn and D.shape[0] == 1))
+    return not together
+
+
+def _block_order_alone(R: Tensor, D: Tensor, B: Tensor, rule: _Rule, learn: bool, patches: bool) -> Tensor:
+    """`_block_order` of one surface, in place; returns the dictionary."""
+    shrinkage = sweep_chunks.Shrinkage([float(m) for m in rule.levels], rule.bound, rule.threshold)
+    H, C = sweep_chunks.update_codes(R[0], D[0], B[0], shrinkage, patches)
+    if not learn:
+        return D
+    new = _update_atoms(H[None], C[None], D, rule)
+    if not patches:
+        R.mT.baddbmm_(B.mT, (D - new).mT)
+    return new
 
 
 class _Rule(NamedTuple):
-    """How codes are shrunk and atoms normalised; `in_place` where nothing is recorded."""
+    """How codes are shrunk and atoms normalised; `in_place` where nothing is recorded, `levels` are those of mu."""
 
-    levels: Sequence[float | Tensor]
+    mu: float | Tensor
     bound: float
     threshold: Threshold
     unused: Unused
-    in_place: bool
     project: Callable[[Tensor], Tensor] | None = None
+    levels: Sequence[float | Tensor] = ()
+    in_place: bool = False
+
+    def cuts(self, B: Tensor) -> Tensor:
+        """(N or 1, K), up to where each code is cut."""
+        mu = torch.as_tensor(self.mu, dtype=B.dtype, device=B.device)
+        mu = mu if mu.ndim == 2 else mu.reshape(1, -1)
+        return torch.as_tensor(cut(mu, self.bound) if self.threshold == "hard" else mu).expand(-1, B.shape[1])
 
     def unit(self, h: Tensor) -> Tensor:
         return _normalize(h if self.project is None else self.project(h))
@@ -291,18 +317,6 @@ def _where_used(atoms: Tensor, D: Tensor, unused: Unused) -> Tensor:
         instead = torch.zeros_like(D)
         instead[:, 0] = 1
     return torch.where((atoms != 0).any(1, keepdim=True), atoms, instead)
-
-
-def _is_fused(R: Tensor, D: Tensor, B: Tensor, mu: float | Tensor) -> bool:
-    """Whether the compiled loops do the sweep."""
-    return sweep_fused.serves(R) and not is_recorded(R, D, B, *([mu] if isinstance(mu, Tensor) else []))
-
-
-def _cuts(mu: float | Tensor, bound: float, threshold: Threshold, B: Tensor) -> Tensor:
-    """(N or 1, K), up to where each code is cut."""
-    mu = torch.as_tensor(mu, dtype=B.dtype, device=B.device)
-    mu = mu if mu.ndim == 2 else mu.reshape(1, -1)
-    return torch.as_tensor(cut(mu, bound) if threshold == "hard" else mu).expand(-1, B.shape[1])
 
 
 def _levels(mu: float | Tensor, B: Tensor, look: bool) -> Sequence[float | Tensor]:
