@@ -38,7 +38,7 @@ def run(tmp_path, monkeypatch):
 
 
 def vertices(path):
-    return torch.from_numpy(np.asarray(trimesh.load(path, process=False).vertices)).double()
+    return torch.from_numpy(np.asarray(trimesh.load_mesh(path, process=False).vertices)).double()
 
 
 def test_a_normal_map_with_mask_and_camera_becomes_a_mesh_and_a_page(run, tmp_path):

@@ -81,9 +81,7 @@ def _cropped(shown: Shown) -> Shown:
         camera[0, 2] -= left
         camera[1, 2] -= top
     fields = {name: getattr(shown, name) for name in ("height", "mask", "gradient", "trust", "jump")}
-    return Shown(
-        pixel_size=shown.pixel_size, camera=camera, **{n: None if f is None else f[box] for n, f in fields.items()}
-    )
+    return shown._replace(camera=camera, **{n: f[box] for n, f in fields.items() if f is not None})
 
 
 def maps_of(result: Any, mask: Tensor | None, weight: Tensor | None) -> dict[str, Any]:
