@@ -110,7 +110,7 @@ def sweep(
     else:
         rows = torch.baddbmm(R.mT, B.mT, D.mT.expand(len(R), -1, -1), alpha=-1) if by_atom else R.mT
     cut = cut.to(B).expand(len(B), -1).contiguous()
-    how = _How(B.new_tensor(bound).numpy()[()], THRESHOLDS.index(threshold), keep, learn, patches)
+    how = _How(B.new_full((), bound).numpy()[()], THRESHOLDS.index(threshold), keep, learn, patches)
     step, new = _atom_order if by_atom else _block_order, []
     alone = len(D) == 1 and learn and len(R) > 1
     for i in (slice(None),) if alone else (slice(k, k + 1) for k in range(len(R))):
@@ -123,9 +123,9 @@ def _block_order(R: Tensor, D: Tensor, codes: Tensor, cut: Tensor, how: _How) ->
     loops, (n, K), length = _loops(), D.shape, _CHUNK * torch.get_num_threads()
     atoms = D.mT.contiguous()
     moves = torch.cat([(atoms @ D).triu(1), atoms], 1).numpy()
-    H, C = (torch.zeros(K, k, dtype=torch.float64) for k in (n, K))
+    H, C = (R.new_zeros(K, k, dtype=torch.float64) for k in (n, K))
     Q, room = codes.new_empty(min(length, R.shape[1]), K), R.new_empty(min(length, R.shape[1]) if how.patches else 0, n)
-    used, counts = (torch.empty(shape, dtype=torch.int16) for shape in (codes.shape, codes.shape[:2]))
+    used, counts = (codes.new_empty(shape, dtype=torch.int16) for shape in (codes.shape, codes.shape[:2]))
 
     def update(level: Any, r: Tensor, q: Tensor, b: Tensor, u: Tensor, many: Tensor) -> tuple[Tensor, Tensor]:
         h, c = R.new_zeros(K, n), R.new_zeros(K, K)
@@ -163,7 +163,7 @@ def _atom_order(R: Tensor, D: Tensor, codes: Tensor, cut: Tensor, how: _How) -> 
     loops, rows, atoms = _loops(), R.flatten(0, 1), D.mT.contiguous()
     new, count = torch.empty_like(atoms), len(rows)
     Q, (before, after) = R.new_empty(_GROUP, count), R.new_empty(2, count)
-    where = torch.empty(count + 1, dtype=torch.int64)
+    where = R.new_empty(count + 1, dtype=torch.int64)
     for start in range(0, len(atoms), _GROUP):
         group = atoms[start : start + _GROUP]
         q = torch.mm(group, rows.mT, out=Q[: len(group)])

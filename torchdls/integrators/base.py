@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torchdls._checks import check_field, require
+from torchdls._checks import check_field
 from torchdls._options import plain, same, shown
 from torchdls._precision import full_precision
 from torchdls._tracing import all_finite
@@ -238,11 +238,11 @@ class Integrator(nn.Module, ABC):
 
     def _finite(self, height: Tensor) -> Tensor:
         """The height, if the numbers of its dtype reach so far."""
-        require(
-            all_finite(height),
-            f"{type(self).__name__}: the height is not finite: slopes, weights or anchors are beyond {height.dtype}",
+        if all_finite(height):
+            return height
+        raise ValueError(
+            f"{type(self).__name__}: the height is not finite: slopes, weights or anchors are beyond {height.dtype}"
         )
-        return height
 
     @property
     def _unit(self) -> float:
@@ -259,7 +259,8 @@ class Integrator(nn.Module, ABC):
     ) -> Fields:
         """Validate the arguments of `from_edges` and bring them to the form of `Fields`."""
         name = type(self).__name__
-        require(self._reads_edges, f"{name}: takes no slopes on edges; LeastSquares, L1, Huber, MEstimator and DLS do")
+        if not self._reads_edges:
+            raise ValueError(f"{name}: takes no slopes on edges; LeastSquares, L1, Huber, MEstimator and DLS do")
         check_accepted(name, self.accepts, mask=mask, anchor=anchor, anchor_weight=anchor_weight)
         check_field(name, "slopes", slopes, 2)
         checked = within_mask(name, fit_fields(name, torch.zeros_like(slopes), mask, None, anchor, anchor_weight))
@@ -276,6 +277,13 @@ class Integrator(nn.Module, ABC):
     ) -> Fields:
         """Validate the arguments of `forward` and bring them to the form of `Fields`; never writes to them."""
         name = type(self).__name__
+        if mask is weight is anchor is anchor_weight is None:
+            check_field(name, "gradient", gradient, 2)
+            h = self._unit
+            steps = (self.pixel_size[0] / h, self.pixel_size[1] / h)
+            fields = Fields(gradient if gradient.ndim == 4 else gradient[None], None, None, None, None, steps)
+            check_values(name, fields)
+            return fields
         check_accepted(name, self.accepts, mask=mask, weight=weight, anchor=anchor, anchor_weight=anchor_weight)
         check_field(name, "gradient", gradient, 2)
         fields = within_mask(name, fit_fields(name, gradient, mask, weight, anchor, anchor_weight))

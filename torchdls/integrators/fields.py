@@ -101,11 +101,10 @@ def check_values(name: str, fields: Fields) -> None:
     for label in ("gradient", "weight", "anchor", "anchor_weight"):
         field = getattr(fields, label)
         if field is not None:
-            require(all_finite(field), f"{name}: {label} {tuple(field.shape)} is not finite{inside}")
-            weight = label.endswith("weight")
-            require(
-                not weight or holds_everywhere(field >= 0), f"{name}: {label} {tuple(field.shape)} is negative{inside}"
-            )
+            if not all_finite(field):
+                raise ValueError(f"{name}: {label} {tuple(field.shape)} is not finite{inside}")
+            if label.endswith("weight") and not holds_everywhere(field >= 0):
+                raise ValueError(f"{name}: {label} {tuple(field.shape)} is negative{inside}")
 
 
 def fit_field(

@@ -55,8 +55,7 @@ def _by_products(gradient: Tensor, pixel_size: tuple[float, float]) -> Tensor:
     with the cosine matrices C, the divergence along a line T (see `slope_divergence`), and gain = 1 / eigenvalue.
     """
     (h, w), (dx, dy) = gradient.shape[-2:], pixel_size
-    across, down = _across(w, dx, like=gradient), _down(h, dy, like=gradient)
-    back, forth, gain = _cosines(h, like=gradient), cosine_matrix(w, like=gradient), _gain(h, w, dx, dy, like=gradient)
+    across, down, back, forth, gain = _products(h, w, dx, dy, like=gradient)
     if gradient.shape[0] == 1 and not torch.compiler.is_compiling():  # the same by plain products, without a batch
         sums = down.mm(gradient[0].bmm(across).view(2 * h, w))
         return back.mm(sums * gain).mm(forth)[None, None]
@@ -65,23 +64,18 @@ def _by_products(gradient: Tensor, pixel_size: tuple[float, float]) -> Tensor:
 
 
 @table
-def _across(w: int, dx: float) -> Tensor:
-    """(2, W, W): what the rows of g_x and of g_y are multiplied by from the right."""
-    cosines = _cosine(w)
-    return torch.stack([(cosines @ _line_divergence(w, dx)).mT, cosines.mT])
+def _products(h: int, w: int, dx: float, dy: float) -> tuple[Tensor, ...]:
+    """What `_by_products` multiplies by.
 
-
-@table
-def _down(h: int, dy: float) -> Tensor:
-    """(H, 2H): by what the columns of both are multiplied from the left, and then added up."""
-    cosines = _cosine(h)
-    return torch.cat([cosines, cosines @ _line_divergence(h, dy)], 1)
-
-
-@table
-def _cosines(n: int) -> Tensor:
-    """The transpose of the cosine matrix, contiguous."""
-    return _cosine(n).mT.contiguous()
+    Returns:
+        What the rows of g_x and of g_y are multiplied by from the right (2, W, W); by what the columns of both are then
+        multiplied from the left and added up (H, 2H); the transpose of C_y; C_x; the gain.
+    """
+    rows, columns = _cosine(h), _cosine(w)
+    across = torch.stack([(columns @ _line_divergence(w, dx)).mT, columns.mT])
+    down = torch.cat([rows, rows @ _line_divergence(h, dy)], 1)
+    gain = _inverse(neumann_eigenvalues((h, w), torch.zeros(0, dtype=torch.float64, device="cpu"), (dx, dy)))
+    return across, down, rows.mT.contiguous(), columns, gain
 
 
 @table

@@ -68,6 +68,10 @@ class WeightedLeastSquares(LeastSquares):
             raise ValueError(f"WeightedLeastSquares: threshold={threshold!r} and floor={floor!r} must be positive")
         self.threshold, self.floor = threshold, floor
 
+    def _is_direct(self, fields: Fields) -> bool:
+        """Never: trust is not equal."""
+        return False
+
     def _solve_fields(self, fields: Fields, z0: Tensor | None = None) -> SolveResult:
         """The solve and how it went, from a warm start z0."""
         v, w, _ = self._data_term(fields)
