@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from math import radians
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,11 +23,10 @@ from torch import Tensor
 
 from benchmarks.common.report import markdown_table, results_folder, write_json
 from benchmarks.quality.scenes import FAMILIES, UNSEEN, Scene, eight_bits, noisy, scene
-from torchdls import INTEGRATORS, denoise_normals, io, normals_to_gradient
+from torchdls import INTEGRATORS, io, normals_to_gradient
 from torchdls.metrics import mean_absolute_depth_error
 
 METHODS = ("least_squares", "bilateral", "slope_dls", "piecewise")
-NOISY = radians(0.9)  # per tangential component: the noise from which normals are coded
 LEVELS = ("0", "5", "10", "20", "8bit")
 
 
@@ -64,18 +62,13 @@ def spoilt(one: Scene, level: str, seed: int) -> Tensor:
 
 
 def integrate(one: Scene, normals: Tensor, name: str) -> Run:
-    """The depth by one method; `piecewise` codes the normals first, before any is dropped."""
-    focal = 1.0 if one.camera is None else float(one.camera[0, 0])
-    options: dict[str, Any] = {"focal_length": focal} if name == "bilateral" else {}
+    """The depth by one method."""
+    focal = None if one.camera is None else float(one.camera[0, 0])
+    options: dict[str, Any] = {"bilateral": {"focal_length": focal or 1.0}, "piecewise": {"focal_length": focal}}
     began = time.process_time()
-    if name == "piecewise":
-        options = {"focal_length": None if one.camera is None else focal}
-        coded, sigma = denoise_normals(normals, one.mask, camera=one.camera)
-        if float(sigma) > NOISY:
-            normals, options["noise"] = coded, float(sigma)
     field = normals_to_gradient(normals, mask=one.mask, camera=one.camera)
     with torch.no_grad():
-        found = INTEGRATORS[name](**options).solve(field.gradient, field.mask)
+        found = INTEGRATORS[name](**options.get(name, {})).solve(field.gradient, field.mask)
     seconds = time.process_time() - began
     depth = -found.height if one.camera is None else found.height.exp()
     return Run(depth, field.mask, getattr(found, "jump", None), seconds)

@@ -146,7 +146,7 @@ def test_derivative_is_that_of_the_last_solve_with_weights_and_jumps_held():
     result = method.solve(leaf)
     assert not result.smooth.any()
     (found,) = torch.autograd.grad((result.height * probe).sum(), leaf)
-    w, d, *_ = _Search.apply(-slopes, None, None, None, None, torch.zeros(1).double(), -1.0, (1.0, 1.0))
+    w, d, *_ = _Search.apply(-slopes, -slopes, None, None, None, None, torch.zeros(1).double(), -1.0, (1.0, 1.0))
 
     def held(t: float) -> Tensor:
         v, _ = edge_slopes(-believed(-(slopes + t * direction)))
@@ -263,6 +263,25 @@ def test_pieces_by_size_and_their_ties():
     anchored = nowhere.clone()
     anchored[..., 0, 0] = True
     assert tied_pieces(pieces, live, anchored).tolist() == [[False, True]]
+
+
+def test_what_noisy_normals_say_of_a_steep_plane_has_no_bias():
+    """Mean slopes of noisy normals are too steep; what is linear in the noise errs by what noise leaves of a mean."""
+    size, steep, sigma = 96, 2.0, 0.1
+    coded = torch.zeros(1, 2, size, size, dtype=torch.float64)
+    coded[:, 0] = steep
+    n = torch.tensor([steep, 0.0, 1.0]).double().view(1, 3, 1, 1) / 5**0.5
+    noise = sigma * random_field(1, 3, size, size, seed=3)
+    n = torch.nn.functional.normalize(n + noise - (noise * n).sum(1, keepdim=True) * n, dim=1)
+    raw, method = n[:, :2] / n[:, 2:], Piecewise()
+    fields = method._check_fields(raw)
+    live = torch.zeros_like(coded, dtype=torch.bool)
+    live[:, 0, :, :-1] = True
+    v = method._told(fields, coded, raw, torch.where(live, coded, 0), torch.tensor([sigma]).double())
+    off, plain = (float((f[live] - steep).mean()) for f in (v, edge_slopes(raw)[0]))
+    spread = sigma * 5 / size  # of the mean of so many samples: 5 = 1 + steep^2
+    assert abs(off) < 3 * spread
+    assert plain > 6 * spread
 
 
 @pytest.mark.parametrize("options", [{"focal_length": 0.0}, {"noise": -1.0}, {"solve_tol": 0.0}])

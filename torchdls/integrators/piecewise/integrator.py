@@ -75,16 +75,17 @@ class Piecewise(Iterative[PiecewiseResult]):
     with slopes v = `edge_slopes` and weights w and jumps d that a search finds first, in depths y that grow away from
     the viewer (by pixels: y = -z, or focal length times log depth):
 
-    1. Noise of the normals is read from the curl of the slopes; where it exceeds 0.9 degrees, the normals are coded
-       (`denoise_normals`), and v with them.
+    1. Noise of the normals is read from the curl of the slopes; where it exceeds 0.9 degrees, the search goes by coded
+       normals (`denoise_normals`). The last solve then goes by those that came, linear in their noise, which averages
+       out: coding shrinks what is steep.
     2. Every edge gets two probabilities of being cut, one for either side being nearer: a logistic regression on the
        angles at which the two normals meet and graze, fitted once on rendered scenes and calibrated on others. So a cut
        has a cost, c = log((1 - P) / P) + log(range / s) - 1, with s the residual that curvature and noise leave.
     3. The energy \sum_e c_e r^2 / (r^2 + s^2), r = A y - v and c that of the side that r makes nearer, is lowered by
-       reweighted solves from two starts: one-sided trusts (as `Bilateral`), and least squares with all open that may be
-       cut, with s falling from 4 s to s and costs that fall where contours go on.
-    4. The second is taken where its energy is lower by 2 % and less than a quarter of its jumps are in the less likely
-       order. Where the surface jumps, and into which pieces it falls, is read from it in any case.
+       reweighted solves from two starts: that of `Bilateral`, and least squares with all open that may be cut, with s
+       falling from 4 s to s and costs that fall where contours go on.
+    4. The second is taken where less than a quarter of its jumps are in the less likely order and, without noise, its
+       energy is lower by 2 %. Where the surface jumps, and into which pieces it falls, is read from it in any case.
 
     Where no jump is found, the height is that of `SlopeDLS`, on a field that does not jump. A piece whose contour
     jumps all around has no tie in the slopes: its height is a guess, the result says so (`tied`), and an anchor sets
@@ -94,12 +95,13 @@ class Piecewise(Iterative[PiecewiseResult]):
 
     The gradient of log depth needs the focal length, by which slopes are brought to pixels and which tells that depths
     grow away; without one, heights grow towards the viewer. The rule has a scale, one pixel: the method does not scale
-    with the slopes. The work is some 30 direct factors, in float64; memory as in `solve`.
+    with the slopes. The work is some 30 to 70 direct factors, in float64; memory as in `solve`.
 
     Args:
         focal_length: of the camera in pixels, where the gradient is that of log depth; None for heights.
-        noise: None to read it from the curl, and to code the normals of the slopes. Or, where the slopes are those of
-            normals that `denoise_normals` has coded, the `sigma` that it found; 0 for slopes without noise.
+        noise: None to read it from the curl, and to code the normals of the slopes: give slopes as they came. Or, where
+            they are those of normals that `denoise_normals` has coded, the `sigma` that it found; 0 for slopes without
+            noise.
         solve_tol: relative residual of the last solve and of its derivative.
         pixel_size: (dx, dy) or one number; heights come out in its unit.
 
@@ -150,11 +152,13 @@ class Piecewise(Iterative[PiecewiseResult]):
     def _held(self, fields: Fields) -> tuple[Quadratic, Tensor, tuple[Tensor, ...]]:
         """The last quadratic, in float64; the noise; cuts, which surfaces have none, pieces, and which are tied."""
         scale = -1.0 if self.focal_length is None else self.focal_length
-        slopes, noise = self._coded(fields, scale * filled(fields.gradient.double(), fields))
+        raw = scale * filled(fields.gradient.double(), fields)
+        coded, noise = self._coded(fields, raw)
         w, d, *found = _Search.apply(
-            slopes, fields.mask, fields.weight, fields.anchor, fields.anchor_weight, noise, scale, fields.steps
+            coded, raw, fields.mask, fields.weight, fields.anchor, fields.anchor_weight, noise, scale, fields.steps
         )
-        return self._joined(fields, believed(slopes) / scale, w, d / scale), noise, tuple(found)
+        v = self._told(fields, coded, raw, d, noise)
+        return self._joined(fields, v / scale, w, d / scale), noise, tuple(found)
 
     def _iterate(self, fields: Fields, callback: Callback | None = None) -> PiecewiseResult:
         """The search, the last solve, and what it says of pieces."""
@@ -170,7 +174,7 @@ class Piecewise(Iterative[PiecewiseResult]):
         """Slopes of the depth in pixels without noise (N, 2, H, W), and what noise their normals had (N,)."""
         if self.noise is not None:
             return p, p.new_full((len(p),), self.noise)
-        n = (1 + p.square().sum(1, keepdim=True)).rsqrt()
+        n = _facing(p)
         inside = torch.ones_like(n, dtype=torch.bool) if fields.mask is None else fields.mask.expand_as(n)
         if fields.weight is not None:
             inside = inside & (fields.weight > 0).all(1, keepdim=True)
@@ -184,14 +188,37 @@ class Piecewise(Iterative[PiecewiseResult]):
         coded = torch.where(inside, unit[:, :2] / torch.where(inside, facing, 1), p)
         return torch.where(noisy[:, None, None, None], coded, p), noise
 
-    def _joined(self, fields: Fields, p: Tensor, w: Tensor, d: Tensor) -> Quadratic:
-        """Of slopes p at the pixels, held to jumps d where edges are cut."""
+    def _told(self, fields: Fields, coded: Tensor, raw: Tensor, d: Tensor, noise: Tensor) -> Tensor:
+        """(N, 2, H, W) what the pixels say of the slope of every edge, in depths.
+
+        Without noise the mean of both ends. With noise, by normals (b, n) as they came and slopes d of the surface that
+        was found from coded ones, d + mean (b - n d) h with h = m / (m^2 + noise^2), m the coded n: linear in the
+        noise, which so averages out, while coding shrinks what is steep.
+        """
         weight = None if fields.weight is None else fields.weight.double()
-        v, trust = edge_slopes(p, fields.mask, weight)
+        v, _ = edge_slopes(believed(coded), fields.mask, weight)
+        if self.noise is not None or (is_concrete(noise) and not bool((noise > 0).any())):
+            return v
+        n, m = (_facing(p) for p in (raw, coded.detach()))
+        m = m.clamp(min=GRAZING)
+        h = m / (m.square() + noise[:, None, None, None].square())
+        b, _ = edge_slopes(h * n * raw, fields.mask, weight)
+        share, _ = edge_slopes((h * n).expand_as(raw), fields.mask, weight)
+        return torch.where(noise[:, None, None, None] > 0, d + b - share * d, v)
+
+    def _joined(self, fields: Fields, v: Tensor, w: Tensor, d: Tensor) -> Quadratic:
+        """Of slopes v of the edges, held to jumps d where edges are cut."""
+        weight = None if fields.weight is None else fields.weight.double()
+        _, trust = edge_slopes(fields.gradient.double(), fields.mask, weight)
         trust = present_edges(v) if trust is None else trust
         w, hold = w * trust, (trust > 0) * _HELD * (w * trust).detach().flatten(1).amax(1)[:, None, None, None]
         total = w + hold
         return Quadratic((w * v + hold * d) / torch.where(total > 0, total, 1), total, fields.steps)
+
+
+def _facing(p: Tensor) -> Tensor:
+    """(N, 1, H, W) cosine between normal and line of sight."""
+    return (1 + p.square().sum(1, keepdim=True)).rsqrt()
 
 
 class _Search(torch.autograd.Function):
@@ -204,6 +231,7 @@ class _Search(torch.autograd.Function):
     @staticmethod
     def forward(
         p: Tensor,
+        raw: Tensor,
         mask: Tensor | None,
         weight: Tensor | None,
         anchor: Tensor | None,
@@ -216,7 +244,7 @@ class _Search(torch.autograd.Function):
         weight, anchor, anchor_weight = double
         anchor = None if anchor is None else scale * anchor
         pull = None if anchor_weight is None else anchor_weight / scale**2
-        fields = Fields(p, mask, weight, anchor, pull, steps)
+        fields = Fields(raw, mask, weight, anchor, pull, steps)
         problem = Problem.of(measure(p, fields, _LEFT * noise), noise, fields)
         live = problem.m.live
         inside = torch.ones_like(p[:, :1], dtype=torch.bool) if mask is None else mask.expand_as(p[:, :1])
@@ -237,7 +265,7 @@ class _Search(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *_: Tensor) -> tuple[None, ...]:
-        return (None,) * 8
+        return (None,) * 9
 
     @staticmethod
     def jvp(ctx: Any, *_: Any) -> tuple[None, ...]:

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchdls.integrators.fields import Fields
 from torchdls.integrators.piecewise.measured import Measured
 from torchdls.integrators.piecewise.prior import continued, features, log_odds
+from torchdls.integrators.robust import Bilateral
 from torchdls.operators import GradientOperator, edge_ends
 from torchdls.solvers.nested_dissection import factor
 
@@ -43,28 +43,22 @@ class Problem(NamedTuple):
         m: the ends.
         phi: features.
         noise: (N,) of the normals that came, in radians.
-        anchor: (N, 1, H, W) depths, or None.
-        anchor_weight: (N, 1, H, W), or None.
-        steps: sides of a pixel.
+        fields: slopes as they came, and anchors.
     """
 
     m: Measured
     phi: Tensor
     noise: Tensor
-    anchor: Tensor | None
-    anchor_weight: Tensor | None
-    steps: tuple[float, float]
+    fields: Fields
 
     @classmethod
     def of(cls, m: Measured, noise: Tensor, fields: Fields) -> Problem:
-        """The problem of what was measured, with the anchors of the fields."""
-        size = m.v[:, :1]
-        anchor, weight = (None if f is None else f.expand_as(size) for f in (fields.anchor, fields.anchor_weight))
-        return cls(m, features(m), noise, anchor, weight, fields.steps)
+        """The problem of what was measured on slopes without noise, with the fields that came."""
+        return cls(m, features(m), noise, fields)
 
     def slopes(self, y: Tensor) -> Tensor:
         """(N, 2, H, W) those of a depth, 0 where there is no edge."""
-        return torch.where(self.m.live, GradientOperator("forward", self.steps)(y), 0)
+        return torch.where(self.m.live, GradientOperator("forward", self.fields.steps)(y), 0)
 
     def jumps(self, y: Tensor) -> Tensor:
         """(N, 2, H, W) how much more a depth grows along the edges than measured."""
@@ -72,14 +66,18 @@ class Problem(NamedTuple):
 
     def solve(self, w: Tensor, v: Tensor | None = None, y: Tensor | None = None) -> Tensor:
         """The minimum of sum w (A y - v)^2 and of the anchors; what is loose is held at y, or at 0."""
-        v, w = self.m.v if v is None else v, w * self.m.trust
+        return self.minimum(w * self.m.trust, self.m.v if v is None else v, y)
+
+    def minimum(self, w: Tensor, v: Tensor, y: Tensor | None = None) -> Tensor:
+        """As `solve`, with weights that hold the trusts."""
         b = w * (v if y is None else v - self.slopes(y))
-        b = GradientOperator("forward", self.steps).adjoint(b)
+        *_, anchor, pull, steps = self.fields
+        b = GradientOperator("forward", steps).adjoint(b)
         r = torch.where(edge_ends(w) > 0, _HOLD * _per_surface(w.flatten(1).amax(1)), 0)
-        if self.anchor is not None and self.anchor_weight is not None:
-            b = b + self.anchor_weight * (self.anchor if y is None else self.anchor - y)
-            r = r + self.anchor_weight
-        x = factor(w, r, self.steps).solve(b)
+        if anchor is not None and pull is not None:
+            b = b + pull * (anchor if y is None else anchor - y)
+            r = r + pull
+        x = factor(w, r, steps).solve(b)
         return x if y is None else y + x
 
 
@@ -146,23 +144,19 @@ def opened(problem: Problem, likely: float = 0.02) -> Tensor:
     return problem.solve((1 + (p / likely).square()).square().reciprocal().clamp(min=1e-6))
 
 
-def bilateral(problem: Problem, n_iter: int = 15, k: float = 2.0) -> Tensor:
-    """One-sided trusts, as in `Bilateral`."""
-    m = problem.m
-    square = m.facing.square()
-    side = torch.full_like(square, 0.5)
-    y: Tensor | None = None
+def bilateral(problem: Problem, n_iter: int = 50, tol: float = 1e-4) -> Tensor:
+    """`Bilateral`, every solve direct, on the slopes as they came: coding takes from a rim which side is smooth."""
+    term = Bilateral()._data_term(problem.fields)
+    v, w = term.terms.quadratic(term.facing.expand_as(term.terms.live))
+    y = problem.minimum(w, v)
+    cost, moves = term.cost(y), torch.ones_like(problem.noise, dtype=torch.bool)
     for _ in range(n_iter):
-        w = side * square
-        total = w.sum(1)
-        v = (w * m.slopes).sum(1) / total.clamp(min=1e-30)
-        y = problem.solve(total.clamp(min=1e-8), v, y)
-        d = problem.slopes(y).square()
-        x_side, y_side = d[:, 0], d[:, 1]
-        before = torch.stack([pad(x_side[..., :-1], (1, 0)), pad(y_side[:, :-1], (0, 0, 1, 0))], 1)
-        after = torch.stack([pad(x_side[..., 1:], (0, 1)), pad(y_side[:, 1:], (0, 0, 0, 1))], 1)
-        side = torch.sigmoid(k * square * (torch.stack([before, after], 1) - d[:, None]))
-    assert y is not None
+        v, w = term.majoriser(y)
+        y = torch.where(_per_surface(moves), problem.minimum(w, v, y), y)
+        before, cost = cost, term.cost(y)
+        moves = moves & ((before - cost).abs() > tol * cost)
+        if not bool(moves.any()):
+            break
     return y
 
 
@@ -200,12 +194,14 @@ def search(problem: Problem) -> Found:
 
     Where all that may be cut starts open, jumps are found best, but what hangs together by nothing lies anywhere.
     Where rims or ties tell the order of the sides, few jumps contradict it; where many do, the one-sided trusts are the
-    safer guess. Otherwise the energy decides. Where the surface jumps, the second start tells in any case.
+    safer guess. Otherwise the energy decides, which tells nothing once noise makes most of it. Where the surface jumps,
+    the second start tells in any case.
     """
     plain = costs(problem, odds(problem))
     safe = robust(problem, bilateral(problem), plain, [1.0] * 6)
     bold = coupled(problem, opened(problem))
     lower = energy(problem, bold, plain) < _CLEARLY * energy(problem, safe, plain)
-    y = torch.where(_per_surface(lower & (out_of_order(problem, bold) < _DISORDER)), bold, safe)
+    chosen = (lower | (problem.noise > 0)) & (out_of_order(problem, bold) < _DISORDER)
+    y = torch.where(_per_surface(chosen), bold, safe)
     cost = costs(problem, odds(problem, y))
     return Found(y, robust_weights(problem, y, cost), posterior(problem, bold))
