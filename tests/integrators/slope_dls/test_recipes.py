@@ -194,6 +194,21 @@ def test_slow_waves_and_the_others_have_weights_of_their_own():
     torch.testing.assert_close(blend, truth, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("left, followed", [(0.1, 1.0), (0.8, 0.0)])
+def test_fine_waves_return_to_least_squares_where_little_was_found(left, followed):
+    """A candidate that leaves a tenth of the noise in every mode, or most of it."""
+    gradient = 0.7 * torch.randn(1, 2, 64, 48, generator=seeded(3), dtype=torch.float64)
+    n, sigma = signs(gradient), torch.tensor([0.7], dtype=torch.float64)
+    plain, moved = LeastSquares()(gradient), LeastSquares()(n)
+    found = blend_by_waves(left * plain[None], left * moved[None], plain, moved, sigma)
+    frequency = torch.hypot(torch.arange(64).double()[:, None] / 128, torch.arange(48).double() / 96)
+    taken = 1 - dct2(found) / dct2(plain)
+    slow = (frequency > 0) & (frequency < 1 / 32)
+    torch.testing.assert_close(taken[..., slow], torch.full_like(taken[..., slow], 1 - left))
+    fine = taken[..., frequency >= 1 / 32]
+    torch.testing.assert_close(fine, torch.full_like(fine, followed * (1 - left)), atol=1e-6, rtol=1e-6)
+
+
 def test_signs_are_balanced_and_uncorrelated():
     n = signs(torch.empty(1, 2, 64, 96, dtype=torch.float64))
     assert n.unique().tolist() == [-1, 1]

@@ -71,7 +71,7 @@ class Problem(NamedTuple):
     def minimum(self, w: Tensor, v: Tensor, y: Tensor | None = None) -> Tensor:
         """As `solve`, with weights that hold the trusts."""
         b = w * (v if y is None else v - self.slopes(y))
-        *_, anchor, pull, steps = self.fields
+        anchor, pull, steps = self.fields.anchor, self.fields.anchor_weight, self.fields.steps
         b = GradientOperator("forward", steps).adjoint(b)
         r = torch.where(edge_ends(w) > 0, _HOLD * _per_surface(w.flatten(1).amax(1)), 0)
         if anchor is not None and pull is not None:

@@ -79,7 +79,10 @@ def blend_by_waves(
     r"""z_ls + sum_m w_m (z_m - z_ls), with weights of their own for the slow waves (period above 32) and the others.
 
     What sees the slow waves best need not be best in the fine ones. Each part has the weights of `sure_weights` for its
-    own risk, to which a fifth of that of the other part is added: few modes make it scatter.
+    own risk, to which a fifth of that of the other part is added: few modes make it scatter. Where little of the noise
+    of the fine waves was found, as on texture, they return to least squares: their part of the sum counts
+
+        r = clip(5 q - 2, 0, 1) times,   q = sum |D|^2 S^-3/4 / (sigma^2 sum S^1/4)   over the fine waves
 
     Args:
         heights: see `sure_weights`, and so for the others.
@@ -98,11 +101,15 @@ def blend_by_waves(
     D, push, change = dct2(heights - reference), dct2(moved), dct2(changes - moved)
     parts = slow, ~slow
     risks = [_risk(D.detach(), push, change, torch.where(part, weight, 0), noise) for part in parts]
-    found = torch.zeros_like(D[0])
-    for part, own, other in zip(parts, risks, reversed(risks), strict=True):
+    blends = []
+    for own, other in zip(risks, reversed(risks), strict=True):
         w = _least_risk(*(a + _SHARED * b for a, b in zip(own, other, strict=True))).to(reference)
-        found = found + torch.where(part, (w.mT[:, :, None, None, None] * D).sum(0), 0)
-    return reference + idct2(found)
+        blends.append((w.mT[:, :, None, None, None] * D).sum(0))
+    fine = torch.where(slow, 0, _weight(reference, pixel_size, 0.75))
+    expected = noise.detach().square() * torch.where(slow, 0, _weight(reference, pixel_size, -0.25)).sum()
+    share = (fine * blends[1].detach().square()).sum((-3, -2, -1)) / torch.where(expected > 0, expected, 1)
+    share = (5 * share - 2).clamp(0, 1)[:, None, None, None]
+    return reference + idct2(torch.where(slow, blends[0], share * blends[1]))
 
 
 def _weight(reference: Tensor, pixel_size: tuple[float, float], norm: float) -> Tensor:
