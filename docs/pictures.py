@@ -209,7 +209,7 @@ def axes_of_conventions(n: int) -> Figure:
     figure, axes = figure_of(len(NORMAL_CONVENTIONS), 3.0)
     for axis, (name, signs) in zip(axes, NORMAL_CONVENTIONS.items(), strict=True):
         normals = torchdls.gradient_to_normals(gradient, name)[0]
-        axis.imshow(np.dstack([((normals + 1) / 2).permute(1, 2, 0), inside]), extent=(-1, 1, -1, 1))
+        axis.imshow(np.dstack([((normals + 1) / 2).permute(1, 2, 0).numpy(), inside.numpy()]), extent=(-1, 1, -1, 1))
         draw_axes(axis, signs)
         axis.set_title(name, fontsize=11, color=INK, loc="left", fontweight="bold")
         bare(axis)
@@ -238,11 +238,11 @@ def gradient_channels(n: int) -> Figure:
     hill = height[0, 0].double().numpy()
     draw_relief(axes[0], hill, (1.0, 1.0), span_of(hill), "a hill, z to you", "")
     normals = torchdls.gradient_to_normals(torch.stack([dx, dy])[None])[0]
-    axes[1].imshow(((normals + 1) / 2).permute(1, 2, 0))
+    axes[1].imshow(((normals + 1) / 2).permute(1, 2, 0).numpy())
     axes[1].set_title("its normals (opengl)", fontsize=10, loc="left", fontweight="bold")
     for axis, slope, name in ((axes[2], dx, "gradient[:, 0] = dz/dx"), (axes[3], dy, "gradient[:, 1] = dz/dy")):
         limit = float(dx.abs().max())
-        image = axis.imshow(slope, cmap="RdBu_r", vmin=-limit, vmax=limit)
+        image = axis.imshow(slope.numpy(), cmap="RdBu_r", vmin=-limit, vmax=limit)
         axis.set_title(name, fontsize=10, loc="left", fontweight="bold")
     figure.colorbar(image, ax=list(axes[2:]), shrink=0.8, label="slope")
     for axis in axes:
@@ -307,7 +307,7 @@ def commit() -> str:
 def main(arguments: list[str] | None = None) -> None:
     """Draw them all, or those that are named, and bring the lines in the pages up to date."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", choices=[*PICTURES, []], metavar="NAME", help=f"of {', '.join(PICTURES)}")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PICTURES)}")
     parser.add_argument("--out", type=Path, default=DOCS / "pictures", help="folder for the pictures")
     parser.add_argument("--smoke", action="store_true", help="of a quarter of the size, and no line in the pages")
     given = parser.parse_args(arguments)

@@ -3,6 +3,7 @@
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +39,8 @@ def run(tmp_path, monkeypatch):
 
 
 def vertices(path):
-    return torch.from_numpy(np.asarray(trimesh.load_mesh(path, process=False).vertices)).double()
+    mesh: Any = trimesh.load(path, process=False)
+    return torch.from_numpy(np.asarray(mesh.vertices)).double()
 
 
 def test_a_normal_map_with_mask_and_camera_becomes_a_mesh_and_a_page(run, tmp_path):

@@ -80,8 +80,9 @@ def _cropped(shown: Shown) -> Shown:
         camera = camera.clone()
         camera[0, 2] -= left
         camera[1, 2] -= top
-    fields = {name: getattr(shown, name) for name in ("height", "mask", "gradient", "trust", "jump")}
-    return shown._replace(camera=camera, **{n: f[box] for n, f in fields.items() if f is not None})
+    fields: dict[str, Any] = {name: getattr(shown, name) for name in ("height", "mask", "gradient", "trust", "jump")}
+    part: dict[str, Any] = {name: None if field is None else field[box] for name, field in fields.items()}
+    return shown._replace(camera=camera, **part)
 
 
 def maps_of(result: Any, mask: Tensor | None, weight: Tensor | None) -> dict[str, Any]:
