@@ -4,6 +4,7 @@ import importlib
 import inspect
 from pathlib import Path
 
+from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 
 ROOMS = {
@@ -28,10 +29,14 @@ TABLES = {"INTEGRATORS": "integrators", "LEARNERS": "dictionary", "PHOTOMETRIC":
 
 
 RESULTS = Path("benchmarks") / "results"
+NOTEBOOKS = Path("notebooks")
 
 
+@event_priority(100)  # before the plugin that reads notebooks
 def on_files(files: Files, config) -> Files:
-    """Add `api.md`, and the pictures and tables of the benchmarks."""
+    """Add `api.md`, the notebooks, and the pictures and tables of the benchmarks."""
+    for path in sorted(NOTEBOOKS.glob("*.ipynb")):
+        files.append(File(path.as_posix(), str(Path.cwd()), config.site_dir, config.use_directory_urls))
     files.append(File.generated(config, "api.md", content=reference()))
     for path in sorted([*RESULTS.glob("*.png"), *RESULTS.glob("*.md")]):
         files.append(File.generated(config, f"benchmarks/{path.name}", abs_src_path=str(path.resolve())))

@@ -14,10 +14,10 @@
 # %% [markdown]
 # # A network that denoises gradients for the surface's sake
 #
-# A small network cleans noisy gradients, a tenth of them plain wrong, before they are integrated. Trained on the error
-# of the gradients it treats all frequencies alike; but integration divides by frequency, so slow errors in the
+# A small network cleans noisy gradients, a tenth of them plain wrong, before they are integrated. Trained on the
+# error of the gradients it treats all frequencies alike; but integration divides by frequency, so slow errors in the
 # gradients become large ones in the height. Trained through the integrator, with the error of the height in the loss,
-# the same network gives better surfaces, though worse gradients.
+# the same network errs less in the height, though more in the gradients.
 
 # %%
 import itertools
@@ -116,12 +116,16 @@ for name, g in results.items():
     print(f"{name:14} RMSE of the gradient {of_gradient:.3f}   of the height {of_height:.3f} pixels")
 
 # %%
-shown = 0
+of_surface = {name: (z - height).square().mean((1, 2, 3)).sqrt() for name, z in heights.items()}
+first, second = of_surface["gradient loss"], of_surface["with height"]
+print(f"better with the height on {int((second < first).sum())} of {len(first)} surfaces")
+shown = int(first.argmax())  # where the error of the gradients let the largest error of the height pass
+print(f"the one shown: {first[shown]:.2f} pixels without the height in the loss, {second[shown]:.2f} with it")
 figure, axes = plt.subplots(1, 5, figsize=(12, 2.6), dpi=80, layout="constrained")
 axes[0].imshow(height[shown, 0])
 axes[0].set_title("true height")
 for axis, (name, z) in zip(axes[1:4], heights.items(), strict=True):
-    picture = axis.imshow((z - height)[shown, 0], cmap="RdBu", vmin=-1.5, vmax=1.5)
+    picture = axis.imshow((z - height)[shown, 0], cmap="RdBu", vmin=-2, vmax=2)
     axis.set_title(f"error, {name}", fontsize=10)
 for axis in axes[:4]:
     axis.axis("off")
@@ -133,3 +137,10 @@ axes[4].set_title("RMSE of the height, training", fontsize=10)
 axes[4].set_xlabel("step")
 axes[4].legend()
 plt.show()
+
+# %% [markdown]
+# ## What was learned
+#
+# With the height in the loss, the same network's error of the height falls from 0.464 to 0.348 pixels, though that of
+# its gradient rises from 0.192 to 0.251. The gain lies where errors are large, as on the surface shown (0.92 to
+# 0.55); it is the better of the two on 16 of 32 surfaces, no more.

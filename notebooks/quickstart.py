@@ -16,7 +16,7 @@
 #
 # Ten pictures of a surface, each under a light whose direction is known, tell the normal at every pixel. The normals
 # give the slopes, and the slopes, integrated, give the surface. The pictures are noisy, so the slopes are too: plain
-# least squares turns that noise into bumps; DLS takes most of them out.
+# least squares turns that noise into bumps; DLS takes many of them out.
 
 # %%
 import matplotlib.pyplot as plt
@@ -29,8 +29,8 @@ surface = torchdls.SURFACES["peaks"](96)  # height (1, 1, H, W) and exact gradie
 # %% [markdown]
 # ## The pictures
 #
-# A Lambertian surface of albedo 1 reflects $\max(0, \ell \cdot n)$ of a distant light of direction $\ell$. The ten
-# lights stand on a ring, 30 degrees from the viewer. Noise: 17 dB, as in the paper's experiment on real pictures.
+# A Lambertian surface of albedo 1 reflects max(0, l · n) of a distant light of direction l. The ten lights stand on a
+# ring, 30 degrees from the viewer. Noise: 17 dB, as in the paper's experiment on real pictures.
 
 # %%
 lights = torchdls.ring_of_lights(10, tilt=30)
@@ -40,8 +40,8 @@ images = torchdls.render(normals, lights, snr_db=17, generator=torch.Generator()
 # %% [markdown]
 # ## From pictures to a surface
 #
-# Least squares over the ten lights gives the albedo times the normal (Woodham 1980). `DLS()` measures the noise of the
-# slopes itself and needs no parameter.
+# Least squares over the ten lights gives the albedo times the normal (Woodham 1980). `DLS()` measures the noise of
+# the slopes itself and needs no parameter.
 
 # %%
 found = torchdls.woodham(images, lights)  # normals, albedo and confidence
@@ -84,3 +84,10 @@ for axis, (title, picture) in zip(axes, panels.items(), strict=True):
     axis.set_title(title)
     axis.axis("off")
 plt.show()
+
+# %% [markdown]
+# ## What was learned
+#
+# With noisy pictures DLS takes the bumps out of the surface, as the angular error says (2.67 to 1.11 degrees); the
+# height itself gains little (RMSE 0.150 to 0.143 pixels, SSIM 0.807 to 0.817), since what is left of its error are
+# waves longer than a patch.

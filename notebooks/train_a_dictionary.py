@@ -15,8 +15,8 @@
 # # A dictionary trained through DLS
 #
 # DLS with a few iterations is a network: its weights are the dictionary, the trust `lam` in the patches and the
-# threshold `mu`. Here they are trained on some surfaces, by back-propagation through the unrolled iterations, and tried
-# on others, against the cosine dictionary and against a dictionary that each surface learns for itself.
+# threshold `mu`. Here they are trained on some surfaces, by back-propagation through the unrolled iterations, and
+# tried on others, against the cosine dictionary and against a dictionary that each surface learns for itself.
 
 # %%
 import matplotlib.pyplot as plt
@@ -108,11 +108,12 @@ print(f"lam {trained.lam.item():.2f}, mu {trained.mu.item():.2f} times the noise
 # %% [markdown]
 # ## On surfaces that it has not seen
 #
-# The rivals have as many iterations, and `mu` and `lam` by the default rule.
+# The rivals have as many iterations, and `mu` and `lam` by the default rule, without the guard that would bring back
+# least squares where little was found.
 
 # %%
 rivals = {
-    "cosine dictionary": torchdls.DLS(learn="fixed", n_iter=ITERATIONS, tol=0.0),
+    "cosine dictionary": torchdls.DLS(learn="fixed", n_iter=ITERATIONS, tol=0.0, select=False),
     "cosines, trained lam and mu": torchdls.DLS(
         learner=torchdls.FixedDictionary(threshold="firm"),
         n_iter=ITERATIONS,
@@ -120,7 +121,7 @@ rivals = {
         lam=trained.lam.detach(),
         mu=trained.mu.detach(),
     ),
-    "self-learned dictionary": torchdls.DLS(n_iter=ITERATIONS, tol=0.0),
+    "self-learned dictionary": torchdls.DLS(n_iter=ITERATIONS, tol=0.0, select=False),
     "trained dictionary": trained,
 }
 generator.manual_seed(1)
@@ -158,3 +159,12 @@ axes[4].plot(losses)
 axes[4].set_xlabel("step")
 axes[4].set_title("loss, of least squares", fontsize=9)
 plt.show()
+
+# %% [markdown]
+# ## What was learned
+#
+# Five iterations over plain cosines already take the error of the slopes on new surfaces from 0.201 (least squares)
+# to 0.138. Training the dictionary gains a little more, 0.130; training `lam` and `mu` alone gains nothing there,
+# 0.139. A dictionary that each surface learns for itself is better still, 0.122: a trained one is for where there is
+# no time to learn. In the height, from 0.401 to 0.361 pixels, the four are alike: its error lies in waves longer than
+# a patch.

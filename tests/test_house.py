@@ -164,3 +164,10 @@ def test_notebook_is_its_source_and_was_run(path: Path) -> None:
     assert ["".join(cell["source"]) for cell in cells] == source, "run `make notebooks-update`"
     assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
     assert any("image/png" in output.get("data", {}) for cell in cells for output in cell["outputs"])
+    # It ends with what was learned, and every figure there was printed above.
+    assert notebook["cells"][-1]["cell_type"] == "markdown"
+    learned = "".join(notebook["cells"][-1]["source"])
+    printed = "".join(line for cell in cells for output in cell["outputs"] for line in output.get("text", []))
+    figures = set(re.findall(r"\d+\.\d+", learned))
+    assert figures
+    assert figures <= set(re.findall(r"\d+\.\d+", printed))
