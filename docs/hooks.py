@@ -45,7 +45,9 @@ def on_files(files: Files, config) -> Files:
 
 def on_page_markdown(markdown: str, page, **_) -> str:
     """Links to them, as the repository has them, lead to their places on the site."""
-    return markdown.replace("](../benchmarks/results/", "](benchmarks/").replace("](CHANGELOG.md)", "")
+    for there, here in (("../benchmarks/results/", "benchmarks/"), ("../notebooks/", "notebooks/")):
+        markdown = markdown.replace(f"]({there}", f"]({here}")
+    return markdown.replace("](CHANGELOG.md)", "")
 
 
 def reference() -> str:
