@@ -152,7 +152,10 @@ def test_denormal_anchor_weights(name, dtype, weight):
         assert off(height - 7, free - free[0, 0, 5, 6]) < 1e-4
 
 
-@pytest.mark.parametrize("name", [name for name in INTEGRATORS if name not in ("dls", "bilateral", "horn_brooks")])
+# Not of those whose trusts follow the surface (they amplify rounding), nor of what thresholds or relaxes.
+@pytest.mark.parametrize(
+    "name", [n for n in INTEGRATORS if n not in ("dls", "bilateral", "anisotropic_diffusion", "horn_brooks")]
+)
 def test_a_ripple_on_a_steep_tilt_in_single_precision(name):
     """A ripple of 5e-3 on slopes of 100: what float32 holds of it, against float64 on the same slopes."""
     y, x = torch.meshgrid(*(torch.arange(32, dtype=torch.float64),) * 2, indexing="ij")

@@ -15,6 +15,7 @@ from torchdls.integrators.classic import (
     SpectralPath,
     SpectralRegularization,
     TikhonovRegularization,
+    WeightedHarkerOLeary,
     integrate_scattered,
 )
 from torchdls.integrators.dls import DLS, DLSResult, Exact, Implicit, Proximal, Unroll, dls_objective
@@ -23,6 +24,7 @@ from torchdls.integrators.robust import (
     L1,
     AnisotropicDiffusion,
     Bilateral,
+    EdgePreserving,
     Huber,
     MEstimator,
     MumfordShah,
@@ -41,6 +43,7 @@ __all__ = [
     "BSpline",
     "Bilateral",
     "DLSResult",
+    "EdgePreserving",
     "Exact",
     "Fields",
     "FrankotChellappa",
@@ -67,6 +70,7 @@ __all__ = [
     "TikhonovRegularization",
     "TotalVariation",
     "Unroll",
+    "WeightedHarkerOLeary",
     "WeightedLeastSquares",
     "dls_objective",
     "integrate_scattered",

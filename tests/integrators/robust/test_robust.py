@@ -18,6 +18,7 @@ from torchdls import (
     L1,
     SURFACES,
     AnisotropicDiffusion,
+    EdgePreserving,
     Exact,
     Huber,
     LeastSquares,
@@ -35,7 +36,7 @@ from torchdls.integrators.robust.convex import shrink
 def make(request: pytest.FixtureRequest) -> Callable[..., Any]:
     """A robust integrator, as a function of its options."""
     name, options = ROBUST[request.param]
-    promising(name, request.node.originalname.removeprefix("test_"))
+    promising(name, request.node.originalname.removeprefix("test_"), request.param)
     return partial(INTEGRATORS[name], **options)
 
 
@@ -315,9 +316,9 @@ def test_derivative_of_weighted_least_squares():
 @pytest.mark.parametrize("masked", [False, True])
 def test_anisotropic_diffusion_is_the_dense_solution(masked):
     g, mask, weight = small_problem(masked, True, channels=1)
-    method = AnisotropicDiffusion(contrast=0.7, n_iter=200, tol=1e-15, solve_tol=1e-11)
+    method = AnisotropicDiffusion(contrast=0.7, follow="field", n_iter=200, tol=1e-15, solve_tol=1e-11)
     fields = method._check_fields(g[None], *(None if f is None else f[None] for f in (mask, weight)))
-    tensors = method._data_term(fields)
+    tensors = method._tensors(fields)
     (xx, yy), xy = tensors.diagonal[0, 0].numpy(), tensors.mixed[0, 0, 0].numpy()
     assert np.abs(xy).max() > 0.2  # else the diagonal alone would do
     rows = residual_rows(g, mask, weight)
@@ -338,8 +339,8 @@ def test_diffusion_tensors():
     """Eigenvalue 1 along an edge and nearly beta across it; no direction where there is no edge."""
     g = torch.zeros(1, 2, 9, 9, dtype=torch.float64)
     g[:, :, 4, 4] = 5 * torch.tensor([0.6, 0.8], dtype=torch.float64)
-    method = AnisotropicDiffusion(beta=0.02)
-    tensors = method._data_term(method._check_fields(g))
+    method = AnisotropicDiffusion(beta=0.02, follow="field")
+    tensors = method._tensors(method._check_fields(g))
     (xx, yy), xy = tensors.diagonal[0, 0, :, 4, 4], tensors.mixed[0, 0, 0, 4, 4]
     T = torch.stack([torch.stack([xx, xy]), torch.stack([xy, yy])])
     across, along = (torch.tensor(e, dtype=torch.float64) for e in ((0.6, 0.8), (-0.8, 0.6)))
@@ -370,9 +371,14 @@ def test_indicator_marks_the_jump():
     lambda: WeightedLeastSquares(threshold=0),
     lambda: Huber(tol=-1),
     lambda: AnisotropicDiffusion(beta=0),
+    lambda: AnisotropicDiffusion(follow="height"),
+    lambda: MumfordShah(indicators=2),
+    lambda: EdgePreserving(lam=-1),
 ])  # fmt: skip
 def test_bad_options(bad):
-    with pytest.raises(ValueError, match=r"smoothing|n_iter|delta|loss|floor|scale|width|threshold|tol|beta"):
+    with pytest.raises(
+        ValueError, match=r"smoothing|n_iter|delta|loss|floor|scale|width|threshold|tol|beta|follow|indic|lam"
+    ):
         bad()
 
 
@@ -407,3 +413,75 @@ def test_two_parts_in_single_precision(make):
     for part in (slice(0, 48), slice(49, 96)):
         truth = z[..., part] - z[..., part].mean()
         assert float((height[..., part] - truth).abs().max()) < 0.02 * float(truth.abs().max())
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_trusts_that_follow_the_surface_are_at_rest(masked):
+    """Where the iteration stands still, the dense normal equations with the trusts of that surface hold."""
+    g, mask, weight = small_problem(masked, True, channels=1)
+    g[0, 2, 3] -= 18  # gentle enough for the iteration to settle
+    method = AnisotropicDiffusion(contrast=1.5, n_iter=400, tol=0, solve_tol=1e-12)
+    fields = method._check_fields(g[None], *(None if f is None else f[None] for f in (mask, weight)))
+    z = method(g[None], fields.mask, fields.weight).flatten().numpy()
+    rows, absent = residual_rows(g, mask, weight), (np.zeros(42), 0.0, 0.0)
+    slope = np.zeros(42)
+    for i in range(6):
+        for j in range(7):
+            for sides in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                pair = [rows.get((i, j, c, s), absent) for c, s in enumerate(sides)]
+                fall = 1 + sum((k @ z) ** 2 for k, _, _ in pair) / 1.5**2
+                for c, (k, v, t) in enumerate(pair):
+                    slope += t * k * (k @ z - v) / fall / (1 + (float(g[c, i, j]) / 75) ** 2) / 4
+    assert np.abs(slope).max() < 1e-7
+
+
+def test_joint_loss_by_its_definition():
+    g, mask, weight = small_problem(True, True, channels=1)
+    method = MEstimator("tukey", scale=1.3, floor=0.01, joint=True)
+    fields = method._check_fields(g[None], mask[None], weight[None])
+    z = random_field(1, 1, 6, 7, seed=8)
+    rows, absent, flat = residual_rows(g, mask, weight), (np.zeros(42), 0.0, 0.0), z.flatten().numpy()
+    cost = 0.0
+    for i in range(6):
+        for j in range(7):
+            for sides in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                pair = [rows.get((i, j, c, s), absent) for c, s in enumerate(sides)]
+                square = sum((k @ flat - v) ** 2 for k, v, _ in pair)
+                rho = 1.3**2 / 6 * (1 - max(0, 1 - square / 1.3**2) ** 3) + 0.005 * square
+                cost += max(t for _, _, t in pair) * rho / 4
+    assert float(method._data_term(fields).cost(z)) == pytest.approx(cost, rel=1e-9)
+
+
+def test_four_indicators_by_lines():
+    """Each field of s minimises its functional along its own rows or columns: a tridiagonal system."""
+    g, mask, weight = small_problem(True, True)
+    method = MumfordShah(kappa=0.6, width=0.8, solve_tol=1e-12, indicators=4)
+    fields = method._check_fields(g[None], mask[None], weight[None])
+    data, z = method._data_term(fields), random_field(1, 1, 6, 7, seed=8)
+    c = data.misfit(z)
+    s = data._replace(tol=1e-12).indicator(c)[0]
+    for number in range(4):
+        for i, j in mask[0].nonzero().tolist():
+            pull = c[0, number, i, j] * s[number, i, j] + 0.36 * (s[number, i, j] - 1)
+            for side in (-1, 1):
+                a, b = (i, j + side) if number % 2 == 0 else (i + side, j)
+                if 0 <= a < 6 and 0 <= b < 7 and mask[0, a, b]:
+                    pull += 0.36 * 0.64 * (s[number, i, j] - s[number, a, b])
+            assert abs(float(pull)) < 1e-8
+
+
+def test_edge_preserving_is_the_minimum_that_scipy_finds():
+    g = random_field(1, 2, 5, 6)
+    A = np.array([row for i in range(5) for j in range(6) for c, (a, b) in enumerate(((i, j + 1), (i + 1, j)))
+                  if a < 5 and b < 6 for row in [np.eye(30)[6 * a + b] - np.eye(30)[6 * i + j]]])  # fmt: skip
+    v = np.array([float(g[0, c, i, j] + g[0, c, a, b]) / 2 for i in range(5) for j in range(6)
+                  for c, (a, b) in enumerate(((i, j + 1), (i + 1, j))) if a < 5 and b < 6])  # fmt: skip
+
+    def cost(z):
+        s = A @ z
+        slope = A.T @ (s - v + 0.4 * s / (1 + (s / 0.7) ** 2))
+        return 0.5 * ((s - v) ** 2).sum() + 0.4 * 0.49 / 2 * np.log1p((s / 0.7) ** 2).sum(), slope
+
+    expected = minimize(cost, LeastSquares()(g).flatten().numpy(), jac=True, method="BFGS", options={"gtol": 1e-10}).x
+    z = EdgePreserving(lam=0.4, delta=0.7, n_iter=500, tol=1e-14)(g).flatten().numpy()
+    np.testing.assert_allclose(z, center(expected, None), atol=1e-5)

@@ -15,6 +15,7 @@ from torchdls.integrators.classic.partial_integrability import PartialIntegrabil
 from torchdls.integrators.classic.scattered import integrate_scattered
 from torchdls.integrators.classic.shapelets import Shapelets
 from torchdls.integrators.classic.spectral_path import SpectralPath
+from torchdls.integrators.classic.weighted_global import WeightedHarkerOLeary
 
 __all__ = [
     "AlphaSurface",
@@ -29,5 +30,6 @@ __all__ = [
     "SpectralPath",
     "SpectralRegularization",
     "TikhonovRegularization",
+    "WeightedHarkerOLeary",
     "integrate_scattered",
 ]
