@@ -85,6 +85,7 @@ CALLS = {
     "save_mesh": {"points": field(3), "mask": mask()},
     "select": {"integrate": torchdls.LeastSquares(), "gradient": field(2), "candidates": 1, "noise": torch.ones(1)},
     "shrink_slow_waves": {"height": field(1), "reference": field(1), "noise": torch.ones(1)},
+    "slope_noise": {"normals": field(3), "covariance": field(6), "camera": camera()},
     "solve": {"v": field(2), "w": field(2), "anchor": field(1), "anchor_weight": field(1), "z0": field(1)},
     "soup_dil_sweep": {**patches(), "B": torch.zeros(1, 16, 9), "mu": torch.ones(16)},
     "sparse_normals": PHOTOMETRIC | {"n_iter": 2},

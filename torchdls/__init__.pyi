@@ -20,6 +20,7 @@ from .geometry import CodedNormals as CodedNormals
 from .geometry import GradientField as GradientField
 from .geometry import GradientToNormals as GradientToNormals
 from .geometry import NormalsToGradient as NormalsToGradient
+from .geometry import SlopeNoise as SlopeNoise
 from .geometry import convert_gradient as convert_gradient
 from .geometry import convert_normals as convert_normals
 from .geometry import denoise_normals as denoise_normals
@@ -30,6 +31,7 @@ from .geometry import height_to_points as height_to_points
 from .geometry import log_depth_to_depth as log_depth_to_depth
 from .geometry import normal_noise as normal_noise
 from .geometry import normals_to_gradient as normals_to_gradient
+from .geometry import slope_noise as slope_noise
 from .integrators import DLS as DLS
 from .integrators import INTEGRATORS as INTEGRATORS
 from .integrators import L1 as L1
@@ -38,6 +40,7 @@ from .integrators import AnisotropicDiffusion as AnisotropicDiffusion
 from .integrators import Bilateral as Bilateral
 from .integrators import BSpline as BSpline
 from .integrators import DLSResult as DLSResult
+from .integrators import EdgePreserving as EdgePreserving
 from .integrators import Exact as Exact
 from .integrators import FrankotChellappa as FrankotChellappa
 from .integrators import HarkerOLeary as HarkerOLeary
@@ -63,6 +66,7 @@ from .integrators import SpectralRegularization as SpectralRegularization
 from .integrators import TikhonovRegularization as TikhonovRegularization
 from .integrators import TotalVariation as TotalVariation
 from .integrators import Unroll as Unroll
+from .integrators import WeightedHarkerOLeary as WeightedHarkerOLeary
 from .integrators import WeightedLeastSquares as WeightedLeastSquares
 from .integrators import dls_objective as dls_objective
 from .integrators import integrate_scattered as integrate_scattered

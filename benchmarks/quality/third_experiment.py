@@ -1,8 +1,9 @@
 """The paper's third experiment: `python -m benchmarks.quality.third_experiment` (add --smoke for a smoke run).
 
-Ten images with noise of 17 dB, least-squares normals, then every default beside least squares, with and without the
-confidence of the normals: on real terrain of three times its relief, and two smoother surfaces. RMSE, mean angular
-error and 1 - SSIM, means over fresh noise. Writes JSON and a Markdown table.
+Ten images with noise of 17 dB, least-squares normals, then every default beside least squares: without weights, with
+the confidence of the normals, and with the inverse variances of both components of the slopes. On real terrain of three
+times its relief, and two smoother surfaces. RMSE, mean angular error and 1 - SSIM, means over fresh noise. Writes JSON
+and a Markdown table.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from torchdls import (
     normals_to_gradient,
     render,
     ring_of_lights,
+    slope_noise,
 )
 from torchdls.metrics import mean_angular_error, rmse, ssim
 from torchdls.photometric import woodham
@@ -47,12 +49,14 @@ def rows(name: str, n: int, seeds: range) -> list[dict[str, Any]]:
     found = woodham(images + torch.cat(draws), ring_of_lights(10), shadow=None)
     field = normals_to_gradient(found.normals)
     truth = (surface.height * factor).expand(len(draws), -1, -1, -1)
+    noise = slope_noise(found.normals, found.covariance)
+    weights = {"none": None, "confidence": found.confidence, "components": noise.weight}
     measured = []
     for label, method in METHODS.items():
-        for weight in (None, found.confidence):
+        for trust, weight in weights.items():
             with torch.no_grad():
                 z = method(field.gradient, None if bool(field.mask.all()) else field.mask, weight)
-            row = {"surface": name, "method": label, "weight": "none" if weight is None else "confidence"}
+            row = {"surface": name, "method": label, "weight": trust}
             values = {
                 "rmse": rmse(z, truth),
                 "angle": mean_angular_error(z, truth),

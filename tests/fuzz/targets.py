@@ -207,6 +207,7 @@ ELSEWHERE = {
     "bivariate_normals": "tests/photometric", "dlnv_normals": "tests/photometric", "dlpi_normals": "tests/photometric",
     "lights_from_ball": "tests/photometric", "refine": "tests/photometric", "load_photographs": "tests/cli",
     "save_normals": "tests/cli", "denoise_height": "tests/dictionary", "denoise_normals": "tests/test_normal_coder.py",
+    "slope_noise": "tests/test_slope_noise.py",
     "normal_noise": "tests/test_normal_coder.py", "integrate_many": "tests/batch", "reconstruct": "normals_to_gradient",
     "integrate_scattered": "tests/integrators/classic", "shrink_slow_waves": "tests/integrators/slope_dls",
     "ConvergenceWarning": "a warning", "INTEGRATORS": "integrators.py", "LEARNERS": "learner",

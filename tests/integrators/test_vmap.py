@@ -72,7 +72,7 @@ def test_photometric_methods(name, argument):
         "lights": lights + 0.1 * random_field(PLACES, 8, 3, seed=5),
     }
     mask = uniform_field(1, 5, 4, seed=8) < 0.8  # of a single surface, the same for all
-    probe, change = random_field(5, 5, 4, seed=6), random_field(*given[argument].shape, seed=7)
+    probe, change = random_field(11, 5, 4, seed=6), random_field(*given[argument].shape, seed=7)
 
     def results(images, lights):
         return torch.cat(PHOTOMETRIC[name](images, lights, mask=mask))

@@ -117,6 +117,23 @@ def test_sparse_regression_survives_arbitrary_outliers():
     assert degrees(woodham(images, lights).normals, normals).median() > 5
 
 
+def test_covariance_is_that_of_the_normals_and_of_their_slopes():
+    """Of 2000 draws of the noise, entry by entry, in units of the whole spread of a pixel."""
+    surface, lights = SURFACES["peaks"](6, dtype=torch.float64), two_rings()[:12]
+    normals = gradient_to_normals(surface.gradient).expand(2000, -1, -1, -1)
+    images = render(normals, lights, 0.7, snr_db=40, generator=seeded(4))
+    found = woodham(images, lights, shadow=None)
+    slopes = torchdls.normals_to_gradient(found.normals).gradient
+    noise = torchdls.slope_noise(found.normals, found.covariance)
+    for given, errors in ((found.covariance, found.normals - normals), (noise.covariance, slopes - surface.gradient)):
+        pairs = [(i, j) for i in range(errors.shape[1]) for j in range(i, errors.shape[1])]
+        spread = torch.stack([(errors[:, i] * errors[:, j]).mean(0) for i, j in pairs])
+        total = sum(spread[k] for k, (i, j) in enumerate(pairs) if i == j)
+        assert ((given.mean(0) - spread) / total).abs().max() < 0.06
+    torch.testing.assert_close(noise.weight, 1 / noise.covariance[:, ::2])
+    assert (noise.weight[:, 0] / noise.weight[:, 1]).std(0).max() < 0.3
+
+
 def test_confidence_is_the_inverse_variance_of_the_slopes():
     surface, lights = SURFACES["peaks"](24, dtype=torch.float64), two_rings()[:12]
     normals = gradient_to_normals(surface.gradient).expand(400, -1, -1, -1)

@@ -8,6 +8,7 @@ from torchdls.geometry.conventions import (
     convert_gradient,
     convert_normals,
 )
+from torchdls.geometry.noise import SlopeNoise, slope_noise
 from torchdls.geometry.normals import (
     ConventionGuess,
     GradientField,
@@ -26,6 +27,7 @@ __all__ = [
     "GradientField",
     "GradientToNormals",
     "NormalsToGradient",
+    "SlopeNoise",
     "convert_gradient",
     "convert_normals",
     "denoise_normals",
@@ -36,4 +38,5 @@ __all__ = [
     "log_depth_to_depth",
     "normal_noise",
     "normals_to_gradient",
+    "slope_noise",
 ]

@@ -33,18 +33,23 @@ class PhotometricResult(NamedTuple):
             s^2 + max(0, r_k^2 - 6.25 s^2) with r_k its residual from the Lambertian model and s their robust scale on
             the whole surface: ordinary noise leaves it as it is, and pixels that are dark, steep, lit by few lights or
             not Lambertian weigh less. 0 where there are no slopes.
+        covariance: (N, 6, H, W), of the errors of the normals, as the entries xx, xy, xz, yy, yz, zz of a symmetric
+            matrix: K / (K - 3) (I - n n^T) (\sum_k l_k l_k^T / var_k)^{-1} (I - n n^T) / albedo^2, with the variances
+            of the confidence and a factor for the three numbers fitted to K samples. 0 where the normal is unknown.
+            With three samples nothing is left to tell the noise by. `slope_noise` carries it on to slopes.
 
     Example:
         >>> normals = torchdls.gradient_to_normals(torchdls.SURFACES["peaks"](16).gradient)
         >>> lights = torchdls.ring_of_lights(10)
         >>> result = torchdls.woodham(torchdls.render(normals, lights), lights)
-        >>> result.normals.shape, result.albedo.shape, result.confidence.shape
-        (torch.Size([1, 3, 16, 16]), torch.Size([1, 1, 16, 16]), torch.Size([1, 1, 16, 16]))
+        >>> result.normals.shape, result.confidence.shape, result.covariance.shape
+        (torch.Size([1, 3, 16, 16]), torch.Size([1, 1, 16, 16]), torch.Size([1, 6, 16, 16]))
     """
 
     normals: Tensor
     albedo: Tensor
     confidence: Tensor
+    covariance: Tensor
 
 
 class Samples(NamedTuple):
@@ -146,22 +151,46 @@ def multiply(m: Tensor, x: Tensor) -> Tensor:
 
 
 def result(b: Tensor, samples: Samples) -> PhotometricResult:
-    """Normals, albedo and confidence of b = albedo * normal."""
+    """Normals, albedo, confidence and covariance of b = albedo * normal."""
     square = b.square().sum(1, keepdim=True)
     known = square > 0
     albedo = torch.where(known, torch.where(known, square, 1).sqrt(), 0)
     normals = b / torch.where(known, albedo, 1)
-    found = PhotometricResult(normals, albedo, _confidence(b, albedo, samples))
+    inverse, some, freedom = _noise(b, albedo, samples)
+    trust = _confidence(b, albedo, inverse, some)
+    spread = tangent_covariance(normals, albedo, inverse, some) * freedom
+    found = PhotometricResult(normals, albedo, trust, spread)
     return found if samples.batched else PhotometricResult(*(t[0] for t in found))
 
 
-def _confidence(b: Tensor, albedo: Tensor, samples: Samples) -> Tensor:
+def _noise(b: Tensor, albedo: Tensor, samples: Samples) -> tuple[Tensor, Tensor, Tensor]:
+    """Covariance of b as its six entries (N, 6, H, W), where it is known, and a factor (N, 1, 1, 1) on it.
+
+    Three numbers are fitted to K samples, so residuals are smaller than noise: by (K - 3) / K in variance.
+    """
     residual = samples.images - shading(b, samples.lights)
     known = albedo > 0 if samples.lit is None else (albedo > 0) & samples.lit
     scale = _scale(residual, samples.images, known.expand_as(residual))
     beyond = (residual.square() - (_ORDINARY * scale).square()).clamp(min=0)
-    weight = torch.where(known, 1 / (scale.square() + beyond), 0)
-    inverse, some = covariance(samples.lights, weight)
+    pixels = (albedo > 0).sum((-3, -2, -1), keepdim=True).clamp(min=1)
+    used = known.expand_as(residual).sum((-3, -2, -1), keepdim=True) / pixels
+    freedom = torch.where(used > 3, used / (used - 3).clamp(min=1), 1).to(b.dtype)
+    return *covariance(samples.lights, torch.where(known, 1 / (scale.square() + beyond), 0)), freedom
+
+
+def tangent_covariance(normals: Tensor, albedo: Tensor, inverse: Tensor, some: Tensor) -> Tensor:
+    """(N, 6, H, W): P C P / albedo^2 of the covariance C of albedo * normal, with P = I - n n^T; 0 where unknown."""
+    some = some & (albedo > 0)
+    across = multiply(inverse, normals)  # C n
+    along = (normals * across).sum(1, keepdim=True)  # n^T C n
+    lean = across - along / 2 * normals  # P C P = C - n lean^T - lean n^T
+    entries = [normals[:, i] * lean[:, j] + lean[:, i] * normals[:, j] for i, j in _PAIRS]
+    left = inverse - torch.stack(entries, 1)
+    return torch.where(some, left / torch.where(some, albedo, 1).square(), 0)
+
+
+def _confidence(b: Tensor, albedo: Tensor, inverse: Tensor, some: Tensor) -> Tensor:
+    """(N, 1, H, W): 1 / variance of the slopes, of mean 1."""
     c00, _, c02, c11, c12, c22 = inverse.split(1, 1)
     some = some & (b[:, 2:] > _FACING * albedo)
     depth = torch.where(some, b[:, 2:], 1)
