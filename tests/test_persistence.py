@@ -48,6 +48,7 @@ OTHER: dict[str, dict[str, Any]] = {
     "huber": {"delta": 0.1, "n_iter": 7},
     "m_estimator": {"loss": "tukey", "scale": 0.4, "floor": 0.01, "n_iter": 4, "joint": True},
     "anisotropic_diffusion": {"beta": 0.2, "follow": "field", "n_iter": 4},
+    "gaussian_kernels": {"sigma": 2.0, "lam": 0.1},
     "edge_preserving": {"lam": 0.5, "delta": 0.2, "n_iter": 4},
     "mumford_shah": {"indicators": 4, "kappa": 0.3, "width": 0.7, "floor": 0.01, "n_iter": 4},
     "bilateral": {"k": 3.0, "focal_length": 2.0, "n_iter": 4},

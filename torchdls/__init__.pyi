@@ -43,6 +43,7 @@ from .integrators import DLSResult as DLSResult
 from .integrators import EdgePreserving as EdgePreserving
 from .integrators import Exact as Exact
 from .integrators import FrankotChellappa as FrankotChellappa
+from .integrators import GaussianKernels as GaussianKernels
 from .integrators import HarkerOLeary as HarkerOLeary
 from .integrators import HornBrooks as HornBrooks
 from .integrators import Huber as Huber

@@ -72,6 +72,7 @@ INTEGRATORS: Registry[Integrator] = Registry(
         "shapelets": "Shapelets",
         "alpha_surface": "AlphaSurface",
         "b_spline": "BSpline",
+        "gaussian_kernels": "GaussianKernels",
         "partial_integrability": "PartialIntegrability",
         "spectral_path": "SpectralPath",
         "harker_oleary": "HarkerOLeary",

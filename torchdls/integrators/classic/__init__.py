@@ -3,6 +3,7 @@
 from torchdls.integrators.classic.alpha_surface import AlphaSurface
 from torchdls.integrators.classic.b_spline import BSpline
 from torchdls.integrators.classic.fourier import FrankotChellappa
+from torchdls.integrators.classic.gaussian_kernels import GaussianKernels
 from torchdls.integrators.classic.global_least_squares import (
     HarkerOLeary,
     SpectralRegularization,
@@ -21,6 +22,7 @@ __all__ = [
     "AlphaSurface",
     "BSpline",
     "FrankotChellappa",
+    "GaussianKernels",
     "HarkerOLeary",
     "HornBrooks",
     "LeastSquares",
