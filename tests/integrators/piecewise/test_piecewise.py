@@ -15,13 +15,14 @@ from torchdls import (
     Piecewise,
     SlopeDLS,
     edge_slopes,
+    gradient_to_normals,
     normals_to_gradient,
     rmse,
     solve,
 )
 from torchdls.integrators.fields import Fields
 from torchdls.integrators.piecewise.integrator import _HELD, _Search
-from torchdls.integrators.piecewise.measured import GRAZING, believed, ends, filled, measure
+from torchdls.integrators.piecewise.measured import GRAZING, believed, ends, filled, follows_tilt, measure
 from torchdls.integrators.piecewise.pieces import pieces_of, tied_pieces
 from torchdls.integrators.piecewise.prior import NAMES, continued, features, fitted, log_odds
 from torchdls.integrators.piecewise.search import Costs, Problem, energy, robust_weights
@@ -282,6 +283,21 @@ def test_what_noisy_normals_say_of_a_steep_plane_has_no_bias():
     spread = sigma * 5 / size  # of the mean of so many samples: 5 = 1 + steep^2
     assert abs(off) < 3 * spread
     assert plain > 6 * spread
+
+
+def test_noise_of_normals_is_told_from_that_of_slopes_and_heeded_where_nothing_jumps():
+    surface = SURFACES["vase"](48, dtype=torch.float64)
+    slopes = surface.gradient + 0.3 * random_field(1, 2, 48, 48, seed=1)
+    n = gradient_to_normals(surface.gradient) + 0.1 * random_field(1, 3, 48, 48, seed=1)
+    tilted = normals_to_gradient(n)
+    inside = torch.ones_like(tilted.mask)
+    assert not follows_tilt(slopes, inside)
+    assert follows_tilt(tilted.gradient, tilted.mask)
+    result = Piecewise().solve(tilted.gradient, tilted.mask)
+    assert result.smooth.all()
+    smooth = SlopeDLS()(tilted.gradient, tilted.mask)
+    errors = [float(rmse(z, surface.height, tilted.mask)) for z in (result.height, smooth)]
+    assert errors[0] < 0.7 * errors[1]
 
 
 @pytest.mark.parametrize("options", [{"focal_length": 0.0}, {"noise": -1.0}, {"solve_tol": 0.0}])

@@ -14,7 +14,7 @@ from torchdls.dictionary.normals import code_normals, curl_noise
 from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import Quadratic
 from torchdls.integrators.iterative import Callback, Iterative
-from torchdls.integrators.piecewise.measured import GRAZING, believed, filled, measure
+from torchdls.integrators.piecewise.measured import GRAZING, believed, filled, follows_tilt, measure
 from torchdls.integrators.piecewise.pieces import pieces_of, tied_pieces
 from torchdls.integrators.piecewise.search import Problem, odds, search
 from torchdls.integrators.slope_dls import SlopeDLS
@@ -40,7 +40,8 @@ class PiecewiseResult(NamedTuple):
             the mask.
         tied: (N, K) bool for K pieces: False for a piece whose contour jumps all around and which no anchor holds. Its
             height is a guess.
-        smooth: (N,) bool, whether no evidence of jumps was found, so that the height is that of `SlopeDLS`.
+        smooth: (N,) bool, whether no evidence of jumps was found. The height is then that of `SlopeDLS`, or that of the
+            last solve where noise is larger on steep slopes, as that of normals is.
         noise: (N,) of the normals, in radians per tangential component.
 
     Example:
@@ -87,9 +88,10 @@ class Piecewise(Iterative[PiecewiseResult]):
     4. The second is taken where less than a quarter of its jumps are in the less likely order and, without noise, its
        energy is lower by 2 %. Where the surface jumps, and into which pieces it falls, is read from it in any case.
 
-    Where no jump is found, the height is that of `SlopeDLS`, on a field that does not jump. A piece whose contour
-    jumps all around has no tie in the slopes: its height is a guess, the result says so (`tied`), and an anchor sets
-    it right.
+    Where no jump is found, the height is that of `SlopeDLS`, on a field that does not jump; but that of the last solve
+    where the noise is found to be one of normals, which makes steep slopes much worse than flat ones. A piece whose
+    contour jumps all around has no tie in the slopes: its height is a guess, the result says so (`tied`), and an anchor
+    sets it right.
 
     The derivative is that of the last solve, with w and d (and so the jumps) held fixed.
 
@@ -149,9 +151,14 @@ class Piecewise(Iterative[PiecewiseResult]):
         v, w, steps = self._held(fields)[0]
         return Quadratic(v.to(fields.gradient.dtype), None if w is None else w.to(fields.gradient.dtype), steps)
 
+    @property
+    def _scale(self) -> float:
+        """By which the gradient becomes that of a depth in pixels."""
+        return -1.0 if self.focal_length is None else self.focal_length
+
     def _held(self, fields: Fields) -> tuple[Quadratic, Tensor, tuple[Tensor, ...]]:
         """The last quadratic, in float64; the noise; cuts, which surfaces have none, pieces, and which are tied."""
-        scale = -1.0 if self.focal_length is None else self.focal_length
+        scale = self._scale
         raw = scale * filled(fields.gradient.double(), fields)
         coded, noise = self._coded(fields, raw)
         w, d, *found = _Search.apply(
@@ -165,9 +172,9 @@ class Piecewise(Iterative[PiecewiseResult]):
         (v, w, steps), noise, (cut, smooth, pieces, tied) = self._held(fields)
         anchor, r = (None if f is None else f.double() for f in (fields.anchor, fields.anchor_weight))
         height = solve(v, w, anchor, r, tol=self.solve_tol, pixel_size=steps).height.to(fields.gradient.dtype)
-        if not is_concrete(smooth) or bool(smooth.any()):
-            even = SlopeDLS()._integrate(fields)
-            height = torch.where(smooth[:, None, None, None], even, height)
+        even = smooth & ~((noise > 0) & follows_tilt(self._scale * fields.gradient, _inside(fields)))
+        if not is_concrete(even) or bool(even.any()):
+            height = torch.where(even[:, None, None, None], SlopeDLS()._integrate(fields), height)
         return PiecewiseResult(height, cut.to(height.dtype), pieces, tied, smooth, noise.to(height.dtype))
 
     def _coded(self, fields: Fields, p: Tensor) -> tuple[Tensor, Tensor]:
@@ -175,9 +182,7 @@ class Piecewise(Iterative[PiecewiseResult]):
         if self.noise is not None:
             return p, p.new_full((len(p),), self.noise)
         n = _facing(p)
-        inside = torch.ones_like(n, dtype=torch.bool) if fields.mask is None else fields.mask.expand_as(n)
-        if fields.weight is not None:
-            inside = inside & (fields.weight > 0).all(1, keepdim=True)
+        inside = _inside(fields)
         noise = curl_noise((p * n).detach(), n.detach(), inside)
         noisy = noise > _NOISY
         noise = torch.where(noisy, noise, 0)
@@ -214,6 +219,13 @@ class Piecewise(Iterative[PiecewiseResult]):
         w, hold = w * trust, (trust > 0) * _HELD * (w * trust).detach().flatten(1).amax(1)[:, None, None, None]
         total = w + hold
         return Quadratic((w * v + hold * d) / torch.where(total > 0, total, 1), total, fields.steps)
+
+
+def _inside(fields: Fields) -> Tensor:
+    """(N, 1, H, W) bool, where slopes are told."""
+    size = fields.gradient[:, :1]
+    inside = torch.ones_like(size, dtype=torch.bool) if fields.mask is None else fields.mask.expand_as(size)
+    return inside if fields.weight is None else inside & (fields.weight > 0).all(1, keepdim=True)
 
 
 def _facing(p: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import avg_pool2d, pad
 
 from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls.integrators.fields import Fields
@@ -71,6 +71,27 @@ def measure(p: Tensor, fields: Fields, noise: Tensor) -> Measured:
     scale = (usual.clamp(min=_LEAST_SCALE).square() + (0.4 * spread).square() + half.square() * own).sqrt()
     unit = torch.cat([p * n, n], 1) / (torch.cat([p * n, n], 1).norm(dim=1, keepdim=True))
     return Measured(slopes, facing, v, trust, unit, _angles(unit), scale)
+
+
+def follows_tilt(p: Tensor, inside: Tensor, least: float = 0.05) -> Tensor:
+    """(N,) bool, whether the curl of slopes p grows with them as noise of normals makes it, not as noise of slopes.
+
+    Noise of normals gives the curl over 2 x 2 pixels a scale s = sqrt((1 + |p|^2) (2 + |p|^2)) times one number.
+    Densities exp(-|c| / b) / 2b with b = m s, m the mean of |c| / s, are compared with one b for all, the mean of |c|.
+    The mean of log b is smaller for what describes the curl better: by `least` nats, for what matters to the height.
+    """
+    if min(p.shape[-2:]) < 2:
+        return torch.zeros(len(p), dtype=torch.bool, device=p.device)
+    x, y = (p[:, 0, :, :-1] + p[:, 0, :, 1:]) / 2, (p[:, 1, :-1] + p[:, 1, 1:]) / 2
+    curl = (x[:, :-1] - x[:, 1:] + y[..., 1:] - y[..., :-1]).abs().flatten(1)
+    square = avg_pool2d(p, 2, 1).square().sum(1)
+    scale = ((1 + square) * (2 + square)).sqrt().flatten(1)
+    live = (avg_pool2d(inside.to(p), 2, 1) > 0.99).flatten(1)
+
+    def mean(f: Tensor) -> Tensor:
+        return torch.where(live, f, 0).sum(1) / live.sum(1).clamp(min=1)
+
+    return (mean(curl) > 0) & (mean(curl / scale).log() + mean(scale.log()) + least < mean(curl).log())
 
 
 def filled(g: Tensor, fields: Fields) -> Tensor:
