@@ -174,7 +174,9 @@ class _Rule(NamedTuple):
         """(N or 1, K), up to where each code is cut."""
         mu = torch.as_tensor(self.mu, dtype=B.dtype, device=B.device)
         mu = mu if mu.ndim == 2 else mu.reshape(1, -1)
-        return torch.as_tensor(cut(mu, self.bound) if self.threshold == "hard" else mu).expand(-1, B.shape[1])
+        found = cut(mu, self.bound) if self.threshold == "hard" else mu
+        assert isinstance(found, Tensor)
+        return found.expand(-1, B.shape[1])
 
     def unit(self, h: Tensor) -> Tensor:
         return _normalize(h if self.project is None else self.project(h))

@@ -20,6 +20,7 @@ from torchdls.operators.edges import edge_ends, extend_edges
 from torchdls.solvers import harmonic_extension, solve
 
 _NORM = 0.25  # of the risk, see `sure_weights`
+_FILLED = 1e-2  # relative residual of the extension from which runs begin: a fill that they improve themselves
 
 
 def _nothing(z: Tensor) -> None:
@@ -107,7 +108,7 @@ class _Surface:
     def run(self, run: Run, start: Tensor, level: Tensor, watch: Callable[[Tensor], None] = _nothing) -> Tensor:
         """The height after all iterations of a run."""
         v, w = edge_slopes(*self.fields[:3])
-        valid, coded = continued(start, w, self.fields.steps, self.tol)
+        valid, coded = continued(start, w, self.fields.steps, max(self.tol, _FILLED), max(run.sizes))
         valid = torch.ones_like(v, dtype=torch.bool) if valid is None else valid
         known = Known(valid.to(v), None if self.noise_trust is None else extend_edges(self.noise_trust))
         a, z = GradientOperator("forward", self.fields.steps), start
@@ -119,14 +120,32 @@ class _Surface:
         return z
 
 
-def continued(z: Tensor, w: Tensor | None, steps: tuple[float, float], tol: float) -> tuple[Tensor | None, Tensor]:
-    """The edges whose slopes are measured, and slopes for the others: those of the harmonic extension."""
+def continued(
+    z: Tensor, w: Tensor | None, steps: tuple[float, float], tol: float, reach: int | None = None
+) -> tuple[Tensor | None, Tensor]:
+    """The edges whose slopes are measured, and slopes for the others: those of the harmonic extension.
+
+    It goes `reach` pixels beyond the window of the measured ones (None: everywhere), where the largest patches end that
+    hold one of them.
+    """
     if w is None:
         return None, z
     held = edge_ends(w) > 0
     if not is_concrete(held) or not bool(held.all()):
-        z = harmonic_extension(z, held, tol=tol, pixel_size=steps)
+        known = reach is not None and is_concrete(held) and bool(held.any())
+        region = _around(held, reach or 0) if known else None
+        z = harmonic_extension(z, held, region, tol=tol, pixel_size=steps)
     return extend_edges(w) > 0, extend_edges(GradientOperator("forward", steps)(z))
+
+
+def _around(held: Tensor, reach: int) -> Tensor:
+    """(1, 1, H, W) bool: the window of the held pixels of all surfaces, so many pixels larger on every side."""
+    found = held.any(0)[0]
+    near = []
+    for hit in (found.any(1), found.any(0)):
+        at, alive = torch.arange(len(hit), device=held.device), hit.nonzero()
+        near.append((at >= alive.min() - reach) & (at <= alive.max() + reach))
+    return (near[0][:, None] & near[1])[None, None]
 
 
 def _probe(fields: Fields, noise: Noise) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torchdls._tracing import is_concrete
+from torchdls._tracing import is_concrete, is_recorded
 from torchdls.integrators.slope_dls.bases import Places
 from torchdls.integrators.slope_dls.blend import blend_by_waves, signs
 from torchdls.integrators.slope_dls.coding import Coded, average
@@ -139,13 +139,14 @@ class Run:
         for rows in places.strips(slopes.shape[0]):
             coefficients = places.across(strips[..., rows, :])
             own = level[:, :, rows] if level.shape[2] > 1 else level
-            limit = (own[..., None] * noise(rows)).detach()
-            kept = (coefficients.detach().abs() - limit).relu().sign()  # 1 above the threshold, else 0
-            coefficients = coefficients * kept
+            in_place = not is_recorded(coefficients, level)
+            kept = _above(coefficients, own[..., None], noise(rows), in_place)
+            coefficients = coefficients.mul_(kept) if in_place else coefficients * kept
             weight = self._weight(places.size, kept, None if trust is None else trust[:, :, rows])
             if weight is not None:
                 weights.append(weight)
-                coefficients = coefficients * weight[..., None]
+                weight = weight[..., None]
+                coefficients = coefficients.mul_(weight) if in_place else coefficients * weight
             totals.append(places.back_across(coefficients))
         total = places.back_down(torch.cat(totals, -2))
         return Coded(total, places.spread(torch.cat(weights, 2)) if weights else places.coverage(slopes))
@@ -156,6 +157,13 @@ class Run:
             return trust
         weight = (size**2 if self.weights == "size" else 1) / (1 + kept.sum(0).sum(-1))
         return weight if trust is None else weight * trust
+
+
+def _above(coefficients: Tensor, level: Tensor, noise: Tensor, in_place: bool) -> Tensor:
+    """1 where a coefficient is above level x noise in size, else 0; without a derivative."""
+    if in_place:
+        return coefficients.abs().addcmul_(level, noise, value=-1).gt_(0)
+    return (coefficients.detach().abs() - (level * noise).detach()).relu().sign()
 
 
 FOUR = (
