@@ -29,7 +29,7 @@ MAY_IMPORT |= {
     "plot": {"operators", "geometry", "metrics"},
     "persistence": {"integrators"},
     "reconstruction": {"operators", "geometry", "integrators"},
-    "large": {"operators", "geometry"},
+    "large": {"operators", "noise", "integrators", "geometry"},
     "batch": {"operators", "solvers", "integrators", "geometry", "io"},
     "_registry": {"dictionary", "integrators"},  # for their types alone: it is read before PyTorch is loaded
 }

@@ -1,10 +1,30 @@
-"""Least squares out of core: equal to the whole, whatever the tiles, the file and the memory."""
+"""Out of core: least squares equal to the whole, whatever the tiles, the file and the memory; SlopeDLS near to it."""
+
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 
-from torchdls import LeastSquares, convert_gradient, gradient_to_normals, io, large
+from torchdls import (
+    DLS,
+    GradientOperator,
+    LeastSquares,
+    SlopeDLS,
+    add_noise,
+    convert_gradient,
+    edge_slopes,
+    gradient_to_normals,
+    io,
+    large,
+    noise_level,
+    rmse,
+    shrink_slow_waves,
+    solve,
+)
+from torchdls.integrators.slope_dls.runs import blended
+from torchdls.integrators.slope_dls.waves import cautious
+from torchdls.large.slope_dls import spans
 from torchdls.surfaces import SURFACES
 
 
@@ -121,6 +141,8 @@ def test_memory_says_how_much_at_once():
         ({"out": np.zeros((8, 9))}, ValueError, r"out \(8, 9\)"),
         ({"out": "z.png"}, ValueError, "unknown format"),
         ({"tile": 0}, ValueError, "tile=0"),
+        ({"halo": -1}, ValueError, "halo=-1"),
+        ({"integrator": SlopeDLS(), "memory": 2**16}, ValueError, "holds no tile with a halo"),
         ({"memory": 10}, ValueError, "holds not one row"),
         ({"convention": "x"}, ValueError, "'x' is unknown"),
     ],
@@ -142,7 +164,96 @@ def test_from_the_command_line(tmp_path, capsys):
     assert "100 x 90 pixels" in capsys.readouterr().out
     found = io.load_height(tmp_path / "z.tiff").height[0, 0].numpy()
     np.testing.assert_allclose(found, whole(np.load(tmp_path / "g.npy")), rtol=0, atol=1e-4)
-    assert main(arguments) == 2
-    assert "--tile: least_squares alone" in capsys.readouterr().err
+    assert main([*arguments, "--method", "dls"]) == 2
+    assert "--tile: least_squares and slope_dls alone" in capsys.readouterr().err
+    assert main([*arguments, "--method", "slope_dls", "--set", "recipe=quick", "--force"]) == 0
+    assert "noise" in capsys.readouterr().out
+    tiled, expected = np.empty((100, 90), np.float32), np.load(tmp_path / "g.npy")
+    large.integrate(expected, tiled, integrator=SlopeDLS(recipe="quick"), tile=64)
+    np.testing.assert_array_equal(io.load_height(tmp_path / "z.tiff").height[0, 0].numpy(), tiled)
     assert main([*arguments, "--method", "least_squares", "--force", "--mask", "m.png"]) == 2
     assert "--mask" in capsys.readouterr().err
+
+
+def smoothed(g, recipe, **options):
+    return SlopeDLS(recipe=recipe, **options)(torch.from_numpy(np.ascontiguousarray(g)))[0].numpy()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"recipe": "quick"}, {"recipe": "quick", "guard": None, "sigma": 0.25}, {"recipe": "blend", "n_iter": 2}],
+)
+def test_one_tile_is_slope_dls(options):
+    g, found = field(70, 90), np.empty((70, 90))
+    whole_height = SlopeDLS(**options, pixel_size=(2.0, 0.5))(torch.from_numpy(g))[0].numpy()
+    result = large.integrate(g, found, integrator=SlopeDLS(**options), pixel_size=(2.0, 0.5), tile=90, memory=2**18)
+    np.testing.assert_allclose(found, whole_height, rtol=0, atol=1e-9)
+    assert result.tiles == (1, 1)
+    assert result.passes[0] > 1
+    expected = options.get("sigma", float(noise_level(torch.from_numpy(g), pixel_size=(2.0, 0.5))))
+    assert result.noise == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_slope_dls_by_tiles_is_near_the_whole():
+    true = SURFACES["tent"](256, dtype=torch.float64)
+    noisy = add_noise(true.gradient, 5, torch.Generator().manual_seed(0))
+    g, found = noisy[0].numpy(), np.empty((256, 256))
+    result = large.integrate(g, found, integrator=SlopeDLS(recipe="quick"), tile=96, halo=32)
+    tiled, together, plain = (
+        float(rmse(torch.from_numpy(z).view(1, 1, 256, 256), true.height))
+        for z in (found, smoothed(g, "quick"), whole(g))
+    )
+    assert result.tiles == (2, 2)
+    assert tiled < 1.05 * together < 0.6 * plain
+
+
+@pytest.mark.parametrize("guard", ["discrepancy", None])
+def test_tiles_are_blended_in_their_slopes_and_solved_once(guard):
+    integrator = SlopeDLS(recipe="quick", n_iter=1, guard=guard)
+    g, found, step = field(90, 70), np.empty((90, 70)), (0.8, 1.25)
+    result = large.integrate(g, found, integrator=integrator, pixel_size=step, tile=20, halo=8, memory=2**17)
+    gradient, a = torch.from_numpy(g)[None], GradientOperator("forward", step)
+    level, slopes = torch.tensor([result.noise], dtype=torch.float64), edge_slopes(gradient)[0]
+    reference = solve(slopes, pixel_size=step).height
+    for rows, p in spans(90, 20, 8):
+        for columns, q in spans(70, 20, 8):
+            part = gradient[..., rows, columns]
+            start, height = blended(integrator.exact_runs, part, level, step, guard is not None)
+            slopes[..., rows, columns] += p[:, None] * q * a(height - start)
+    smooth = solve(slopes, pixel_size=step).height
+    expected = shrink_slow_waves(smooth, reference, level, step, 24.0)
+    expected = expected if guard is None else cautious(expected, reference, smooth, level, step)
+    np.testing.assert_allclose(found, expected[0, 0].numpy(), rtol=0, atol=1e-9)
+    assert result.tiles == (4, 3)
+    whole_level = float(noise_level(gradient, pixel_size=step))
+    assert result.noise == pytest.approx(whole_level, rel=0.1)
+
+
+@pytest.mark.parametrize("n, tile, halo", [(256, 96, 32), (1000, 64, 16), (101, 10, 3), (65, 1, 0), (7, 100, 5)])
+def test_windows_cover_the_surface_and_their_weights_add_up(n, tile, halo):
+    found, total = spans(n, tile, halo), torch.zeros(n, dtype=torch.float64)
+    for pixels, weight in found:
+        assert pixels.stop - pixels.start == min(n, tile + 2 * halo)
+        assert float(weight.min()) >= 0
+        total[pixels] += weight
+        if pixels.start:  # the rim counts for nothing
+            assert not weight[: halo // 2].any()
+    torch.testing.assert_close(total, torch.ones_like(total), rtol=0, atol=1e-12)
+    assert all(b.pixels.start - a.pixels.start <= tile + 1 for a, b in pairwise(found))
+
+
+@pytest.mark.parametrize(
+    "integrator, error, match",
+    [
+        (DLS(), TypeError, "LeastSquares or SlopeDLS"),
+        (SlopeDLS(recipe="plain"), ValueError, "not done in tiles"),
+        (SlopeDLS(robust=True), ValueError, "robust=True"),
+        (SlopeDLS(guard="sure"), ValueError, "guard='sure'"),
+        (SlopeDLS(sigma=torch.ones(1, 1, 8, 8)), ValueError, "not done in tiles"),
+        (LeastSquares(boundary="dirichlet"), ValueError, "boundary='dirichlet'"),
+    ],
+)
+def test_what_is_not_done_in_tiles(integrator, error, match):
+    with pytest.raises(error, match=match):
+        large.integrate(np.zeros((2, 8, 8)), np.zeros((8, 8)), integrator=integrator)

@@ -305,13 +305,20 @@ def height_noise(shape: tuple[int, int], like: Tensor, pixel_size: tuple[float, 
 
 @table
 def _height_noise(shape: tuple[int, int], pixel_size: tuple[float, float]) -> Tensor:
-    h, w = shape
+    return height_noise_part(shape, (0, shape[0]), (0, shape[1]), pixel_size)
+
+
+def height_noise_part(
+    shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int], pixel_size: tuple[float, float]
+) -> Tensor:
+    """`height_noise` in float64 of the modes from and up to (without) a row, and alike for columns; not kept."""
     y, x = (
-        torch.sin(torch.arange(n, dtype=torch.float64, device="cpu") * (math.pi / (2 * n))).square() for n in (h, w)
+        torch.sin(torch.arange(*part, dtype=torch.float64, device="cpu") * (math.pi / (2 * n))).square()
+        for part, n in zip((rows, columns), shape, strict=True)
     )
     a_y, a_x = 4 * y[:, None] / pixel_size[1] ** 2, 4 * x / pixel_size[0] ** 2
     total = a_x + a_y
-    total[0, 0] = 1
+    total = torch.where(total > 0, total, 1)  # 0 for the mean alone
     return (a_x * (1 - x) + a_y * (1 - y)[:, None]) / total.square()
 
 

@@ -1,7 +1,8 @@
-"""Least squares out of core: `python -m benchmarks.speed.large` (minutes, 4 GB of disk; --smoke, or --sizes 4096 8192).
+"""Surfaces out of core: `python -m benchmarks.speed.large` (minutes, 4 GB of disk; --smoke, or --sizes 4096 8192).
 
 Time, the largest memory of the process's own (pages of files left out), and the difference from the whole where that is
-made as well (up to 4096 pixels a side).
+made as well (least squares up to 4096 pixels a side, SlopeDLS up to 1024). `--method slope_dls --surface tent --tile
+256` measures SlopeDLS by tiles: errors of the tiles, the whole and least squares on a surface with noise (5 dB).
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ import torch
 
 from benchmarks.common.report import results_folder, write_json
 from benchmarks.common.timing import fresh_process
-from torchdls import LeastSquares, large
+from torchdls import LeastSquares, SlopeDLS, add_noise, large
+from torchdls.integrators.slope_dls.integrator import Recipe
+from torchdls.surfaces import SURFACES
 
 
 def own_megabytes() -> float:
@@ -72,16 +75,74 @@ def point(n: int, megabytes: int) -> dict[str, Any]:
     return row
 
 
+def write_surface(folder: Path, name: str, n: int) -> None:
+    """A surface with noise of 5 dB, and its heights."""
+    surface = SURFACES[name](n, dtype=torch.float32)
+    noisy = add_noise(surface.gradient, 5, torch.Generator().manual_seed(0))
+    np.save(folder / "g.npy", noisy[0].numpy())
+    np.save(folder / "true.npy", surface.height[0, 0].numpy())
+
+
+def tiles(folder: Path, tile: int, recipe: Recipe) -> dict[str, Any]:
+    """SlopeDLS by tiles of the surface in a folder."""
+    torch.set_num_threads(1)
+    begin, start, cpu = own_megabytes(), time.perf_counter(), time.process_time()
+    with Watch() as watch:
+        integrator = SlopeDLS(recipe=recipe)
+        result = large.integrate(folder / "g.npy", folder / "z.npy", integrator=integrator, tile=tile)
+    row: dict[str, Any] = {"recipe": recipe, "size": result.shape[0], "tile": tile, "tiles": result.tiles}
+    row |= {"seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - cpu}
+    row |= {"own_megabytes": watch.most, "before_megabytes": begin}
+    true, g = np.load(folder / "true.npy"), torch.from_numpy(np.load(folder / "g.npy"))
+    row["rmse"] = deviation(np.load(folder / "z.npy"), true)
+    row["rmse_least_squares"] = deviation(LeastSquares()(g)[0].numpy(), true)
+    if result.shape[0] <= 1024:
+        cpu = time.process_time()
+        row["rmse_whole"] = deviation(integrator(g)[0].numpy(), true)
+        row["cpu_seconds_whole"] = time.process_time() - cpu
+    return row
+
+
+def deviation(height: np.ndarray[Any, Any], true: np.ndarray[Any, Any]) -> float:
+    """Root mean square of the error, less its mean."""
+    return float((height - true.astype(np.float64)).std())
+
+
+def measure_tiles(args: argparse.Namespace) -> list[dict[str, Any]]:
+    rows = []
+    for n in [96] if args.smoke else args.sizes:
+        with tempfile.TemporaryDirectory() as folder:
+            write_surface(Path(folder), args.surface, n)
+            tile = 16 if args.smoke else args.tile
+            said = fresh_process("benchmarks.speed.large", "--tiles", folder, str(tile), args.recipe)
+        rows.append({"surface": args.surface} | json.loads(said.splitlines()[-1]))
+        print(rows[-1], flush=True)
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--smoke", action="store_true", help="tiny sizes, to see that it runs")
     parser.add_argument("--sizes", type=int, nargs="+", default=[2048, 4096, 8192, 16384])
     parser.add_argument("--memory", type=int, default=1024, help="megabytes (default: 1024)")
+    parser.add_argument("--method", choices=("least_squares", "slope_dls"), default="least_squares")
+    parser.add_argument("--surface", choices=SURFACES, default="tent", help="of slope_dls")
+    parser.add_argument("--tile", type=int, default=512, help="of slope_dls")
+    parser.add_argument("--recipe", choices=("blend", "quick"), default="quick", help="of slope_dls")
+    parser.add_argument("--tiles", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--point", nargs=2, type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.point:
         print(json.dumps(point(*args.point)))
         return
+    if args.tiles:
+        print(json.dumps(tiles(Path(args.tiles[0]), int(args.tiles[1]), args.tiles[2])))
+        return
+    if args.smoke or args.method == "slope_dls":
+        name = f"large_tiles_{args.surface}_{args.recipe}_{args.tile}"
+        write_json(results_folder(args.smoke) / f"{name}.json", points=measure_tiles(args))
+        if not args.smoke:
+            return
     rows = []
     for n in [96, 128] if args.smoke else args.sizes:
         said = fresh_process("benchmarks.speed.large", "--point", str(n), str(1 if args.smoke else args.memory))

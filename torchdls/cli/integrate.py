@@ -39,8 +39,8 @@ def add_integrate(commands: Any) -> None:
     add("--set", action="append", default=[], metavar="NAME=VALUE", help="option of the method, such as lam=0.5")
     add("--mask", metavar="FILE", help="image or array; white or nonzero is valid")
     add_manner(command)
-    add("--tile", type=int, metavar="N", help="least_squares of a full NPY, Zarr or TIFF of floats, larger than memory "
-        "if need be, N rows or columns at a time, to NPY, Zarr or BigTIFF")  # fmt: skip
+    add("--tile", type=int, metavar="N", help="least_squares or slope_dls of a full NPY, Zarr or TIFF of floats, "
+        "larger than memory if need be, by N rows or columns (slope_dls: tiles), to NPY, Zarr or BigTIFF")  # fmt: skip
     add("--unit", metavar="NAME", help="unit of the heights, for the labels of pictures, such as mm")
     add("--force", action="store_true", help="replace output files that exist")
     add("--quiet", action="store_true", help="no progress bar and no report")
@@ -123,22 +123,33 @@ def _write_picture(path: str, height: Tensor, found: Map, maps: dict[str, Any], 
 
 
 def _integrate_large(arguments: argparse.Namespace) -> None:
-    """Least squares out of core."""
+    """Least squares out of core, or SlopeDLS by tiles."""
     from torchdls import large
 
-    if arguments.method != "least_squares" or arguments.set:
-        raise ValueError("--tile: least_squares alone, without options, is done in tiles")
+    if arguments.method not in ("least_squares", "slope_dls"):
+        raise ValueError("--tile: least_squares and slope_dls alone are done in tiles")
     for name in ("mask", "camera", "channels"):
         if getattr(arguments, name) is not None:
             raise ValueError(f"--tile: full rectangles alone are done in tiles, --{name} is given")
     if arguments.float64 or len(arguments.out) > 1:
         raise ValueError("--tile: in the precision of the input and to one output; --float64 or several -o are given")
-    start, size = time.perf_counter(), _pixel_size(arguments.pixel_size) or 1.0
-    options = {"convention": arguments.convention, "tile": arguments.tile, "overwrite": arguments.force}
-    result = large.integrate(arguments.input, arguments.out[0], pixel_size=size, **options)
+    start, size = time.perf_counter(), _pixel_size(arguments.pixel_size) or (1.0, 1.0)
+    result = large.integrate(
+        arguments.input,
+        arguments.out[0],
+        integrator=build_method(arguments.method, size, arguments.set),
+        convention=arguments.convention,
+        tile=arguments.tile,
+        overwrite=arguments.force,
+    )
     if not arguments.quiet:
         (h, w), seconds = result.shape, time.perf_counter() - start
-        print(f"least_squares: {h} x {w} pixels in {seconds:.2f} s -> {arguments.out[0]}")
+        level = (
+            ""
+            if result.noise is None
+            else f", noise {result.noise:.3g} in the slopes, {result.tiles[0]} x {result.tiles[1]} tiles,"
+        )
+        print(f"{arguments.method}: {h} x {w} pixels{level} in {seconds:.2f} s -> {arguments.out[0]}")
 
 
 def _source(arguments: argparse.Namespace) -> Source:

@@ -7,7 +7,7 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
-from torchdls.integrators.slope_dls.waves import slow_waves
+from torchdls.integrators.slope_dls.waves import slow_modes
 from torchdls.noise import height_noise
 from torchdls.operators import dct2, idct2
 from torchdls.operators.tables import table
@@ -97,7 +97,8 @@ def blend_by_waves(
         (N, 1, H, W); differentiable in the heights and the reference, with the weights held fixed.
     """
     weight = _weight(reference, pixel_size, norm)
-    slow = slow_waves((reference.shape[-2], reference.shape[-1]), _PERIOD, reference)
+    shape = (reference.shape[-2], reference.shape[-1])
+    slow = slow_modes(shape, shape, _PERIOD, reference)
     D, push, change = dct2(heights - reference), dct2(moved), dct2(changes - moved)
     parts = slow, ~slow
     risks = [_risk(D.detach(), push, change, torch.where(part, weight, 0), noise) for part in parts]

@@ -222,6 +222,11 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
             given["n_iter"] = self.n_iter
         return [replace(run, **given) for run in runs]
 
+    @property
+    def exact_runs(self) -> list[Run]:
+        """The runs of the recipe for full rectangles with equal trust; none for "plain"."""
+        return self._runs(_RUNS[self.recipe])
+
     def _to_pixel_size(self, result: SlopeDLSResult) -> SlopeDLSResult:
         """The height in the unit of `pixel_size`; slopes and their codes have none."""
         return result._replace(height=result.height * self._unit)
@@ -272,7 +277,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
                 callback(len(misfit) - 1, misfit[-1].detach())
 
         guarded = self.guard is not None
-        height = smooth(self._runs(_RUNS[self.recipe]), fields.gradient, noise.overall, fields.steps, guarded, watch)
+        height = smooth(self.exact_runs, fields.gradient, noise.overall, fields.steps, guarded, watch)
         return SlopeDLSResult(height, None, None, torch.stack(misfit, 1), noise.level, height)
 
     def _plain(self, fields: Fields, noise: Noise, callback: Callback | None = None) -> SlopeDLSResult:

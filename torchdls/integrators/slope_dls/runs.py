@@ -199,6 +199,25 @@ def smooth(
         (N, 1, H, W); differentiable, with the supports of the codes, the weights of the blend and the choices of the
         shrinkage held fixed.
     """
+    start, blend = blended(runs, gradient, noise, steps, guard, watch)
+    height = shrink_slow_waves(blend, start, noise, steps, slow_period(runs))
+    return cautious(height, start, blend, noise, steps) if guard else height
+
+
+def slow_period(runs: Sequence[Run]) -> float:
+    """The shortest period in pixels of the waves that are shrunk after these runs."""
+    return _PERIODS[len(runs) > 1]
+
+
+def blended(
+    runs: Sequence[Run],
+    gradient: Tensor,
+    noise: Tensor,
+    steps: tuple[float, float],
+    guard: bool = True,
+    watch: Callable[[Tensor], None] = lambda z: None,
+) -> tuple[Tensor, Tensor]:
+    """The least-squares height, and that of `smooth` before its slow waves are looked at."""
     start = _least_squares(gradient, steps)
     heights = []
     for k, run in enumerate(runs):
@@ -208,10 +227,9 @@ def smooth(
             if k == 0:
                 watch(z)
         heights.append(z)
-    blend = heights[0] if len(runs) == 1 else _blend(runs, torch.stack(heights), start, gradient, noise, steps, guard)
-    period = _PERIODS[len(runs) > 1]
-    height = shrink_slow_waves(blend, start, noise, steps, period)
-    return cautious(height, start, blend, noise, steps) if guard else height
+    if len(runs) == 1:
+        return start, heights[0]
+    return start, _blend(runs, torch.stack(heights), start, gradient, noise, steps, guard)
 
 
 def _blend(

@@ -62,17 +62,28 @@ def shrink_slow_waves(
         shapes = f"height {tuple(height.shape)} and noise {tuple(noise.shape)}"
         raise ValueError(f"shrink_slow_waves: {shapes} given, (N, 1, H, W) and (N,) are needed")
     shape = (height.shape[-2], height.shape[-1])
-    slow = slow_waves(shape, period, height)
+    slow = slow_modes(shape, shape, period, height)
     eigenvalue = neumann_eigenvalues(shape, height, pixel_size)
     s2 = noise.square()[:, None, None, None] * height_noise(shape, height, pixel_size) * eigenvalue
     x2 = dct2(reference).square() * eigenvalue
+    return idct2(dct2(height) * slow_factors(x2, s2, slow))
+
+
+def slow_factors(x2: Tensor, s2: Tensor, slow: Tensor) -> Tensor:
+    """f_k of `shrink_slow_waves`, 1 for modes that are not slow.
+
+    Args:
+        x2: (N, 1, h, w) squares of the coefficients, of all modes or of the first ones that hold all slow ones.
+        s2: (N, 1, h, w), their variances.
+        slow: (h, w) bool.
+    """
     seen = slow & (x2 > 0)
     ratio = torch.where(seen, s2 / torch.where(seen, x2, 1), 0)
     risks = torch.stack([_risk(x2.detach(), s2.detach(), ratio.detach(), slow, t) for t in _THRESHOLDS])
     share = torch.softmax(-risks / _TEMPERATURE, 0)
     factor = torch.stack([(1 - t * t * ratio).clamp(min=0) for t in _THRESHOLDS])
     mean = (share[..., None, None, None] * factor).sum(0)
-    return idct2(dct2(height) * torch.where(slow, mean, 1))
+    return torch.where(slow, mean, 1)
 
 
 def cautious(
@@ -107,14 +118,21 @@ def cautious(
     weight = torch.where(variance > 0, torch.where(variance > 0, variance, 1).pow(-0.25), 0)
     removed = (weight * dct2((removed_by - reference).detach()).square()).sum((-3, -2, -1))
     energy = (weight * (variance if moved is None else dct2(moved.detach()).square())).sum((-2, -1)).flatten()
-    risk = noise.detach().square() * energy
+    share = share_followed(removed, noise.detach().square() * energy)
+    return reference + share[:, None, None, None] * (height - reference)
+
+
+def share_followed(removed: Tensor, risk: Tensor) -> Tensor:
+    """r of `cautious` (N,), from the numerator and the denominator of q."""
     share = torch.where(risk > 0, removed / torch.where(risk > 0, risk, 1), 0)
-    return reference + (share / _LEAST_CUT - 1).clamp(0, 1)[:, None, None, None] * (height - reference)
+    return (share / _LEAST_CUT - 1).clamp(0, 1)
 
 
-def slow_waves(shape: tuple[int, int], period: float, like: Tensor) -> Tensor:
-    """(H, W) bool: the modes of longer period, without the mean."""
-    rows, columns = (torch.arange(n, dtype=like.dtype, device=like.device) / (2 * n) for n in shape)
+def slow_modes(part: tuple[int, int], shape: tuple[int, int], period: float, like: Tensor) -> Tensor:
+    """Bool of the first (h, w) modes of a surface (H, W): those of longer period, without the mean."""
+    rows, columns = (
+        torch.arange(k, dtype=like.dtype, device=like.device) / (2 * n) for k, n in zip(part, shape, strict=True)
+    )
     frequency = (rows.square()[:, None] + columns.square()).sqrt()
     return (frequency > 0) & (frequency < 1 / period)
 

@@ -1,0 +1,151 @@
+"""`torchdls.large.integrate`: least squares, and SlopeDLS by tiles, from file to file."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from torchdls.integrators import Integrator, LeastSquares, SlopeDLS
+from torchdls.large.files import Field, checked_output, parts, write
+from torchdls.large.least_squares import least_squares
+from torchdls.large.slope_dls import HALO, noise_of, slope_dls, spans
+from torchdls.large.transform import Passes, rows_at_once
+from torchdls.operators import as_pixel_size
+
+# Bytes that a pixel of a window takes while it is smoothed, for float32 (measured: 1,100).
+_WINDOW = 1200
+
+
+class LargeResult(NamedTuple):
+    """What `integrate` did.
+
+    Attributes:
+        shape: (H, W).
+        tile: rows of a band, and columns of a strip; of SlopeDLS the side of a tile.
+        passes: the bands, strips and bands of the (last) solve.
+        tiles: rows and columns of tiles; (0, 0) for least squares, which needs none.
+        noise: standard deviation of one gradient sample, as SlopeDLS took it; None for least squares.
+    """
+
+    shape: tuple[int, int]
+    tile: int
+    passes: tuple[int, int, int]
+    tiles: tuple[int, int] = (0, 0)
+    noise: float | None = None
+
+
+def integrate(
+    source: str | os.PathLike[str] | Any,
+    out: str | os.PathLike[str] | Any,
+    *,
+    integrator: Integrator | None = None,
+    convention: str | None = None,
+    pixel_size: float | Sequence[float] | None = None,
+    tile: int | None = None,
+    halo: int = HALO,
+    memory: int = 2**30,
+    scratch: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    progress: Callable[[str], None] = lambda text: None,
+) -> LargeResult:
+    r"""The height of a full rectangle that need not fit into memory, by `LeastSquares` or `SlopeDLS`.
+
+    Least squares is exact: equal to that of the whole to rounding, in three passes over a file. SlopeDLS smooths tiles
+    with a halo, with the noise level of the whole, and blends the slopes of what it changed,
+
+        z = argmin ||A z - v - sum_t p_t A (z_t - z_ls,t)||^2,      sum_t p_t = 1
+
+    by one exact solve; slow waves, and how far least squares is left, are then judged by the whole. One tile is
+    SlopeDLS itself; more differ by some percent of its error (docs/scale.md).
+
+    Besides the files it takes `scratch` space of one height (SlopeDLS: two), and `memory` for its own arrays; time
+    grows as H W log(H W). Masks, weights and anchors are not taken: their solve is iterative.
+
+    Args:
+        source: gradient (2, H, W) or normals (3, H, W) of floats: an NPY file, a Zarr array, an uncompressed TIFF, or
+            anything with `shape` that gives arrays for slices.
+        out: NPY, Zarr or a tiled BigTIFF, written whole or not at all (Zarr: a new array), or anything of shape (H, W)
+            that takes arrays for slices of rows.
+        integrator: `LeastSquares()`, which None stands for, or `SlopeDLS(...)` with the recipe "blend" or "quick",
+            without `robust`, with one noise level or None, and with the guard "discrepancy" or None.
+        convention: of the gradient (default: image) or of the normals (default: opengl).
+        pixel_size: (dx, dy) or one number; None for that of the integrator.
+        tile: rows of a band and columns of a strip, or the side of a tile of SlopeDLS; None for as many as `memory`
+            holds.
+        halo: pixels that a tile sees beyond itself on every side.
+        memory: bytes for arrays of its own; pages of files in the system's cache are not counted.
+        scratch: folder for the files in between; None for that of `out`, or the usual one for temporary files.
+        overwrite: replace an existing file.
+        progress: told of each pass.
+
+    Returns:
+        `LargeResult`.
+
+    Raises:
+        TypeError: the entries are no floats, or the integrator is of another class.
+        ValueError: the shape, format, convention or an option is not usable, a value is not finite, or a normal faces
+            away.
+        OSError: a file cannot be opened or written. ImportError: the library for a format is not installed.
+
+    Source: Simchony, Chellappa, Shao (1990) for the solve.
+
+    Example:
+        >>> import numpy
+        >>> slopes, height = torchdls.SURFACES["peaks"](96).gradient[0], numpy.empty((96, 96), "float32")
+        >>> torchdls.large.integrate(slopes.numpy().astype("float32"), height, tile=32).passes
+        (3, 3, 3)
+        >>> bool(torch.allclose(torch.from_numpy(height), torchdls.LeastSquares()(slopes.float())[0], atol=1e-4))
+        True
+    """
+    method = LeastSquares() if integrator is None else integrator
+    _check(method, tile, halo)
+    field = Field.open(source, convention)
+    size, smooths = field.shape, isinstance(method, SlopeDLS)
+    held = rows_at_once(memory, size, field.dtype, 1 + smooths) if tile is None or smooths else tile
+    step = method.pixel_size if pixel_size is None else as_pixel_size(pixel_size)
+    beside = checked_output(out, size, overwrite)
+    tile = (_tile(memory, halo, field.dtype) if smooths else held) if tile is None else tile
+    bands, strips = (len(list(parts(n, held))) for n in size)
+    result = LargeResult(size, tile, (bands, strips, bands))
+    with tempfile.TemporaryDirectory(prefix=".torchdls-", dir=scratch or beside) as place, torch.no_grad():
+        passes = Passes(field, step, held, Path(place), progress)
+        if isinstance(method, SlopeDLS):
+            windows = spans(size[0], tile, halo), spans(size[1], tile, halo)
+            level = noise_of(passes, method, windows)
+            heights = slope_dls(passes, method, windows, level)
+            result = result._replace(tiles=(len(windows[0]), len(windows[1])), noise=float(level))
+        else:
+            heights = least_squares(passes)
+        write(out, heights, size, field.dtype, overwrite)
+    return result
+
+
+def _tile(memory: int, halo: int, dtype: Any) -> int:
+    """Side of the largest tile whose window `memory` holds."""
+    side = math.isqrt(memory * 4 // (_WINDOW * np.dtype(dtype).itemsize)) - 2 * halo
+    if side < 1:
+        raise ValueError(f"large.integrate: memory={memory} holds no tile with a halo of {halo} pixels")
+    return side // 128 * 128 or side
+
+
+def _check(method: Integrator, tile: int | None, halo: int) -> None:
+    if type(method) is LeastSquares:
+        usable = method.boundary == "neumann"
+    elif type(method) is SlopeDLS:
+        single = method.sigma is None or torch.as_tensor(method.sigma).numel() == 1
+        usable = method.recipe != "plain" and not method.robust and method.guard != "sure" and single
+    else:
+        raise TypeError(f"large.integrate: integrator={method!r} given, LeastSquares or SlopeDLS is needed")
+    if not usable:
+        raise ValueError(f"large.integrate: {method!r} is not done in tiles, with these options")
+    if tile is not None and not tile > 0:
+        raise ValueError(f"large.integrate: tile={tile!r} given, a positive number of pixels is needed")
+    if not halo >= 0:
+        raise ValueError(f"large.integrate: halo={halo!r} given, at least 0 pixels are needed")
