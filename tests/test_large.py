@@ -22,7 +22,7 @@ from torchdls import (
     shrink_slow_waves,
     solve,
 )
-from torchdls.integrators.slope_dls.runs import blended
+from torchdls.integrators.slope_dls.runs import Grid, blended
 from torchdls.integrators.slope_dls.waves import cautious
 from torchdls.large.slope_dls import spans
 from torchdls.surfaces import SURFACES
@@ -219,7 +219,7 @@ def test_tiles_are_blended_in_their_slopes_and_solved_once(guard):
     for rows, p in spans(90, 20, 8):
         for columns, q in spans(70, 20, 8):
             part = gradient[..., rows, columns]
-            start, height = blended(integrator.exact_runs, part, level, step, guard is not None)
+            start, height = blended(integrator.exact_runs, part, level, Grid(step), guard is not None)
             slopes[..., rows, columns] += p[:, None] * q * a(height - start)
     smooth = solve(slopes, pixel_size=step).height
     expected = shrink_slow_waves(smooth, reference, level, step, 24.0)

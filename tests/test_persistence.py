@@ -144,7 +144,7 @@ def test_every_learner_is_a_part(name: str) -> None:
 
 def test_a_public_dataclass_is_a_part() -> None:
     """As the objects are that an option may hold beside the registered ones."""
-    assert plain(Patches(4, 2)) == {"name": "Patches", "size": (4, 4), "stride": (2, 2)}
+    assert plain(Patches(4, 2)) == {"name": "Patches", "size": (4, 4), "stride": (2, 2), "wrap": False}
     with pytest.raises(ValueError, match="size: 0 given"):
         torchdls.build("dls", learner={"name": "Patches", "size": 0})
     with pytest.raises(ValueError, match="learner: 'select' is unknown"):

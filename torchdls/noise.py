@@ -13,7 +13,15 @@ from torchdls._statistics import NORMAL_MEDIAN, masked_median
 from torchdls._tracing import holds_everywhere
 from torchdls.operators import as_pixel_size, dst2, edge_slopes, present_edges
 from torchdls.operators.cosine import cosine_matrix
-from torchdls.operators.edges import cell_curl, cell_edges, complete_cells, mean_trust
+from torchdls.operators.edges import (
+    cell_curl,
+    cell_edges,
+    complete_cells,
+    mean_trust,
+    wrapped_cell_curl,
+    wrapped_edge_slopes,
+)
+from torchdls.operators.modes import Boundary, mode_sines
 from torchdls.operators.sine import squared_sines
 from torchdls.operators.tables import table
 from torchdls.solvers.units import unit_of
@@ -98,7 +106,11 @@ def noise_level(
 
 
 def noise_if_told(
-    gradient: Tensor, mask: Tensor | None, weight: Tensor | None, pixel_size: tuple[float, float]
+    gradient: Tensor,
+    mask: Tensor | None,
+    weight: Tensor | None,
+    pixel_size: tuple[float, float],
+    boundary: Boundary = "neumann",
 ) -> tuple[Tensor, Tensor]:
     """`noise_level` of checked fields (N,), and whether a cell tells it (N,): 0 where none does.
 
@@ -107,10 +119,15 @@ def noise_if_told(
     n, (dx, dy) = gradient.shape[0], pixel_size  # not len(), which a graph for every batch size cannot follow
     if min(gradient.shape[-2:]) < 2:
         return gradient.new_zeros(n), torch.zeros(n, dtype=torch.bool, device=gradient.device)
-    v, w = edge_slopes(gradient, mask)
+    v, w = edge_slopes(gradient, mask) if boundary == "neumann" else (wrapped_edge_slopes(gradient), None)
     unit = unit_of(v.detach().abs().amax((1, 2, 3)))  # squares of slopes of order 1 are within any dtype
     curl = cell_curl(v / unit[:, None, None, None], (dx, dy))
     scale = math.hypot(dx, dy)
+    if boundary == "periodic":
+        curl = wrapped_cell_curl(v / unit[:, None, None, None], (dx, dy))
+        spectral = _wrapped_spectral_scale(curl, dx, dy)
+        sigma = torch.minimum(_robust_scale(curl / scale), spectral)
+        return sigma * unit, torch.ones(n, dtype=torch.bool, device=gradient.device)
     if w is None and weight is None:
         sigma = torch.minimum(_robust_scale(curl / scale), _spectral_scale(curl, dx, dy))
         return sigma * unit, torch.ones(n, dtype=torch.bool, device=gradient.device)
@@ -172,6 +189,24 @@ def _spectral_scale(curl: Tensor, dx: float, dy: float) -> Tensor:
     return _robust_scale(coefficients * _gain(h, w, dx, dy, like=curl), _high_modes(h, w, like=curl) > 0)
 
 
+def _wrapped_spectral_scale(curl: Tensor, dx: float, dy: float) -> Tensor:
+    """(N,) the same on a torus, from the magnitudes of Fourier coefficients, whose squares are exponential variables.
+
+    A turn around the torus changes their phases alone. The root mean square of those within `_CUT` root mean squares,
+    as the median tells them, over what it is for pure exponentials.
+    """
+    h, w = curl.shape[-2:]
+    gain = _wrapped_gain(h, w, dx, dy, like=curl)
+    magnitude = torch.fft.fft2(curl, norm="ortho").abs() * gain
+    live = (gain > 0).expand_as(magnitude)
+    median = masked_median(magnitude.detach().flatten(1), live.flatten(1))
+    kept = live & (magnitude <= (_CUT / math.sqrt(math.log(2)) * median)[:, None, None])
+    rest = math.exp(-_CUT * _CUT)
+    norm = torch.linalg.vector_norm(torch.where(kept, magnitude, 0), dim=(-2, -1))
+    share = 1 - _CUT * _CUT * rest / (1 - rest)
+    return norm / (share * kept.sum((-2, -1), dtype=curl.dtype).clamp(min=1)).sqrt()
+
+
 def _robust_scale(x: Tensor, valid: Tensor | None = None) -> Tensor:
     """(N,) standard deviation of normal variables (N, h, w) among outliers.
 
@@ -195,6 +230,14 @@ def _gain(h: int, w: int, dx: float, dy: float) -> Tensor:
 @table
 def _high_modes(h: int, w: int) -> Tensor:
     return (squared_sines(h)[:, None] + squared_sines(w) > 0.5).double()
+
+
+@table
+def _wrapped_gain(h: int, w: int, dx: float, dy: float) -> Tensor:
+    """Of the high modes; 0 for the others, and for a chequerboard, which has no curl."""
+    y, x = mode_sines(h, "periodic")[:, None], mode_sines(w, "periodic")
+    variance = 4 * (dx * dx * y * (1 - x) + dy * dy * x * (1 - y))
+    return torch.where((y + x > 0.5) & (variance > 1e-9), variance.clamp(min=1e-9).rsqrt(), 0)
 
 
 def _check(gradient: Tensor, mask: Tensor | None, weight: Tensor | None) -> None:
@@ -283,29 +326,37 @@ def _third_differences(g: Tensor, trust: Tensor, dim: int) -> tuple[Tensor, Tens
 _PERIOD = 128  # side of the periodic grid on which the spectrum of the projected noise is sampled
 
 
-def height_noise(shape: tuple[int, int], like: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor:
+def height_noise(
+    shape: tuple[int, int],
+    like: Tensor,
+    pixel_size: tuple[float, float] = (1.0, 1.0),
+    boundary: Boundary = "neumann",
+) -> Tensor:
     r"""Variance of the cosine coefficients of a least-squares height, for white noise of variance 1 in the gradient.
 
         S_kl = (a_x c_x + a_y c_y) / (a_x + a_y)^2,   S_00 = 0
         a_x = 4 sin^2(w_x / 2) / dx^2,   c_x = cos^2(w_x / 2),   w_x = pi l / W,   and alike in y
 
     c is what averaging the slopes of two neighbours leaves of their noise, 1 / a what integration makes of it. The
-    coefficients (of `dct2`) are exactly uncorrelated on a rectangle with equal trust in all slopes.
+    coefficients (of `dct2`) are exactly uncorrelated on a rectangle with equal trust in all slopes. On a torus they are
+    those of `hartley2`, with w_x = 2 pi l / W.
 
     Args:
         shape: (H, W).
         like: a tensor of the wanted dtype and device.
         pixel_size: (dx, dy).
+        boundary: "neumann" or "periodic".
 
     Returns:
         (H, W).
     """
-    return _height_noise(tuple(shape), tuple(pixel_size), like=like)
+    return _height_noise(tuple(shape), tuple(pixel_size), boundary, like=like)
 
 
 @table
-def _height_noise(shape: tuple[int, int], pixel_size: tuple[float, float]) -> Tensor:
-    return height_noise_part(shape, (0, shape[0]), (0, shape[1]), pixel_size)
+def _height_noise(shape: tuple[int, int], pixel_size: tuple[float, float], boundary: Boundary) -> Tensor:
+    y, x = (mode_sines(n, boundary) for n in shape)
+    return _noise_of_modes(y, x, pixel_size)
 
 
 def height_noise_part(
@@ -316,6 +367,11 @@ def height_noise_part(
         torch.sin(torch.arange(*part, dtype=torch.float64, device="cpu") * (math.pi / (2 * n))).square()
         for part, n in zip((rows, columns), shape, strict=True)
     )
+    return _noise_of_modes(y, x, pixel_size)
+
+
+def _noise_of_modes(y: Tensor, x: Tensor, pixel_size: tuple[float, float]) -> Tensor:
+    """From the sin^2(w / 2) of rows and columns."""
     a_y, a_x = 4 * y[:, None] / pixel_size[1] ** 2, 4 * x / pixel_size[0] ** 2
     total = a_x + a_y
     total = torch.where(total > 0, total, 1)  # 0 for the mean alone

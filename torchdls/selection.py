@@ -17,6 +17,7 @@ from torchdls._checks import check_alike, check_field, check_whole, require
 from torchdls._precision import full_precision
 from torchdls.noise import height_noise, noise_level
 from torchdls.operators import as_pixel_size, dct2, edge_slopes, idct2
+from torchdls.operators.modes import Boundary, from_modes, half_periods, to_modes
 from torchdls.operators.tables import table
 from torchdls.solvers import solve
 
@@ -33,6 +34,7 @@ def discrepancy_guard(
     pixel_size: tuple[float, float] = (1.0, 1.0),
     *,
     allowance: float = 1.0,
+    boundary: Boundary = "neumann",
 ) -> Tensor:
     r"""Give back to a smoothed height what was taken from it beyond the noise, band by band.
 
@@ -50,29 +52,34 @@ def discrepancy_guard(
         noise: (N,) standard deviation of one gradient sample.
         pixel_size: (dx, dy).
         allowance: a.
+        boundary: "neumann" or "periodic".
 
     Returns:
         (N, 1, H, W).
     """
     shape = (height.shape[-2], height.shape[-1])
-    variance = height_noise(shape, height, pixel_size)
-    return reference + idct2(within_noise(dct2(height - reference), variance, noise, allowance))
+    variance = height_noise(shape, height, pixel_size, boundary)
+    difference = to_modes(height - reference, boundary)
+    return reference + from_modes(within_noise(difference, variance, noise, allowance, boundary), boundary)
 
 
-def within_noise(difference: Tensor, variance: Tensor, noise: Tensor, allowance: float = 0.0) -> Tensor:
+def within_noise(
+    difference: Tensor, variance: Tensor, noise: Tensor, allowance: float = 0.0, boundary: Boundary = "neumann"
+) -> Tensor:
     """The modes of a difference, every band of them scaled down to the energy that noise explains.
 
     Args:
-        difference: (N, 1, H, W) cosine modes.
+        difference: (N, 1, H, W) modes.
         variance: (N, 1, H, W), or what broadcasts to it, of each mode for noise of standard deviation 1.
         noise: (N,) standard deviation.
         allowance: a in `discrepancy_guard`.
+        boundary: "neumann" or "periodic".
 
     Returns:
         (N, 1, H, W) modes.
     """
     shape = (difference.shape[-2], difference.shape[-1])
-    band = _bands(*shape, like=difference).long().flatten()
+    band = _bands(*shape, boundary, like=difference).long().flatten()
     n_bands = _most_bands(*shape)
     weight = torch.where(band.view(shape) > 0, 1 / torch.where(variance > 0, variance, 1), 0)
     removed = _band_sums((difference.square() * weight).flatten(1), band, n_bands)
@@ -84,10 +91,10 @@ def within_noise(difference: Tensor, variance: Tensor, noise: Tensor, allowance:
     return difference * share[:, band].view_as(difference)
 
 
-def band_means(energy: Tensor) -> Tensor:
+def band_means(energy: Tensor, boundary: Boundary = "neumann") -> Tensor:
     """(N, 1, H, W) means of the modes' energies over the bands of `discrepancy_guard`, at every mode of the band."""
     shape = (energy.shape[-2], energy.shape[-1])
-    band = _bands(*shape, like=energy).long().flatten()
+    band = _bands(*shape, boundary, like=energy).long().flatten()
     n_bands = _most_bands(*shape)
     count = _band_sums(energy.new_ones(1, band.numel()), band, n_bands).clamp(min=1)
     return (_band_sums(energy.flatten(1), band, n_bands) / count)[:, band].view_as(energy)
@@ -104,9 +111,9 @@ def _most_bands(h: int, w: int) -> int:
 
 
 @table
-def _bands(h: int, w: int) -> Tensor:
-    """(H, W) number of the band of each cosine mode; 0 for those that are left alone."""
-    y, x = (torch.arange(n, dtype=torch.float64, device="cpu") for n in (h, w))
+def _bands(h: int, w: int, boundary: Boundary) -> Tensor:
+    """(H, W) number of the band of each mode; 0 for those that are left alone."""
+    y, x = (half_periods(n, boundary) for n in (h, w))
     radius = (y[:, None].square() * (w / h) + x.square() * (h / w)).sqrt()
     ring = 1 + (radius.clamp(min=1).log() / math.log(_RATIO)).floor()
     sector = (torch.atan2(y[:, None] * w, x * h) * (2 * _SECTORS / math.pi)).floor().clamp(max=_SECTORS - 1)
@@ -148,7 +155,7 @@ def sure_guard(height: Tensor, reference: Tensor, change: Tensor, moved: Tensor,
     Source: Stein (1981); Ramani, Blu, Unser, "Monte-Carlo SURE", IEEE TIP 17(9), 2008.
     """
     shape = (height.shape[-2], height.shape[-1])
-    band = _bands(*shape, like=height).long().flatten()
+    band = _bands(*shape, "neumann", like=height).long().flatten()
     n_bands = _most_bands(*shape)
     difference, along, push = (dct2(x) for x in (height - reference, change - moved, moved))
     energy = _band_sums(difference.square().flatten(1), band, n_bands)

@@ -18,7 +18,7 @@ from torchdls._precision import full_precision
 from torchdls._tracing import all_finite
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.fields import Fields as Fields
-from torchdls.integrators.fields import check_accepted, check_values, edge_fields, fit_fields, within_mask
+from torchdls.integrators.fields import check_accepted, check_values, edge_fields, fit_fields, on_torus, within_mask
 from torchdls.operators import as_pixel_size
 
 Callback = Callable[[int, Tensor], None]
@@ -261,7 +261,7 @@ class Integrator(nn.Module, ABC):
         name = type(self).__name__
         if not self._reads_edges:
             raise ValueError(f"{name}: takes no slopes on edges; LeastSquares, L1, Huber, MEstimator and DLS do")
-        check_accepted(name, self.accepts, mask=mask, anchor=anchor, anchor_weight=anchor_weight)
+        check_accepted(name, self.accepts, False, mask=mask, anchor=anchor, anchor_weight=anchor_weight)
         check_field(name, "slopes", slopes, 2)
         checked = within_mask(name, fit_fields(name, torch.zeros_like(slopes), mask, None, anchor, anchor_weight))
         check_values(name, checked)
@@ -277,18 +277,24 @@ class Integrator(nn.Module, ABC):
     ) -> Fields:
         """Validate the arguments of `forward` and bring them to the form of `Fields`; never writes to them."""
         name = type(self).__name__
+        torus = self._on_torus
         if mask is weight is anchor is anchor_weight is None:
             check_field(name, "gradient", gradient, 2)
             h = self._unit
             steps = (self.pixel_size[0] / h, self.pixel_size[1] / h)
             fields = Fields(gradient if gradient.ndim == 4 else gradient[None], None, None, None, None, steps)
             check_values(name, fields)
-            return fields
-        check_accepted(name, self.accepts, mask=mask, weight=weight, anchor=anchor, anchor_weight=anchor_weight)
+            return on_torus(name, fields) if torus else fields
+        check_accepted(name, self.accepts, torus, mask=mask, weight=weight, anchor=anchor, anchor_weight=anchor_weight)
         check_field(name, "gradient", gradient, 2)
         fields = within_mask(name, fit_fields(name, gradient, mask, weight, anchor, anchor_weight))
         check_values(name, fields)
-        return self._in_pixels(fields)
+        return self._in_pixels(on_torus(name, fields) if torus else fields)
+
+    @property
+    def _on_torus(self) -> bool:
+        """Whether the surface repeats: an option of few methods."""
+        return getattr(self, "boundary", None) == "periodic"
 
     def _in_pixels(self, fields: Fields) -> Fields:
         """The fields for heights in units of one pixel."""

@@ -9,6 +9,8 @@ from torch import Tensor
 from torchdls.integrators.fields import Fields
 from torchdls.noise import averaging_error
 from torchdls.operators import GradientOperator, edge_slopes
+from torchdls.operators.edges import wrapped_edge_slopes
+from torchdls.operators.modes import Boundary
 
 
 class DataTerm(Protocol):
@@ -35,6 +37,8 @@ def edges_of(fields: Fields) -> tuple[Tensor, Tensor | None]:
     """Slopes v and trusts w on the edges of the grid; weights count beside what averaging itself errs by."""
     if fields.on_edges:
         return fields.gradient, fields.weight
+    if fields.boundary == "periodic":
+        return wrapped_edge_slopes(fields.gradient), None
     if fields.weight is None:
         return edge_slopes(fields.gradient, fields.mask)
     error = averaging_error(fields.gradient, fields.mask, fields.weight, fields.steps)
@@ -47,11 +51,12 @@ class Quadratic(NamedTuple):
     v: Tensor
     w: Tensor | None
     steps: tuple[float, float]
+    boundary: Boundary = "neumann"
 
     @classmethod
     def of(cls, fields: Fields) -> Quadratic:
         """That of least squares: slopes and trusts of the edges."""
-        return cls(*edges_of(fields), fields.steps)
+        return cls(*edges_of(fields), fields.steps, fields.boundary)
 
     @property
     def steady(self) -> bool:
@@ -60,7 +65,7 @@ class Quadratic(NamedTuple):
 
     def cost(self, z: Tensor) -> Tensor:
         """(N,) its value at z."""
-        misfit = (GradientOperator("forward", self.steps)(z) - self.v).square()
+        misfit = (GradientOperator("forward", self.steps, self.boundary)(z) - self.v).square()
         return 0.5 * (misfit if self.w is None else self.w * misfit).sum((-3, -2, -1))
 
     def majoriser(self, z: Tensor) -> tuple[Tensor, Tensor | None]:

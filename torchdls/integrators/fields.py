@@ -10,6 +10,7 @@ from torch import Tensor
 from torchdls._checks import check_fit, require
 from torchdls._tracing import all_finite, holds_everywhere
 from torchdls.operators import edge_slopes, present_edges
+from torchdls.operators.modes import Boundary
 from torchdls.solvers.units import unit_of
 
 
@@ -26,6 +27,7 @@ class Fields(NamedTuple):
         anchor_weight: (N, 1, H, W), or (N, 1, 1, 1) for one number per surface, or None.
         steps: (dx / h, dy / h), the sides of a pixel of unit area.
         on_edges: whether slopes and weights are those of the edges, as `edge_slopes` lays them out.
+        boundary: how the grid ends; "periodic" comes without mask and weight, and with one anchor weight per surface.
     """
 
     gradient: Tensor
@@ -35,13 +37,15 @@ class Fields(NamedTuple):
     anchor_weight: Tensor | None
     steps: tuple[float, float]
     on_edges: bool = False
+    boundary: Boundary = "neumann"
 
 
-def check_accepted(name: str, accepts: frozenset[str], **given: object) -> None:
+def check_accepted(name: str, accepts: frozenset[str], torus: bool, **given: object) -> None:
     """ValueError for an argument that the method cannot honour."""
     for label, field in given.items():
         taken = "anchor" if label == "anchor_weight" else label
-        require(field is None or taken in accepts, f"{name}: takes no {taken}; LeastSquares and DLS do")
+        other = " with boundary='periodic'" if torus else "; LeastSquares and DLS do"
+        require(field is None or taken in accepts, f"{name}: takes no {taken}{other}")
 
 
 def fit_fields(
@@ -67,7 +71,7 @@ def fit_fields(
 
 def within_mask(name: str, fields: Fields) -> Fields:
     """Zero outside the mask, and anchors zero where they are not trusted: NaN there goes no further."""
-    gradient, mask, weight, anchor, trust, steps, on_edges = fields
+    gradient, mask, weight, anchor, trust, *_ = fields
     if mask is not None:
         some = holds_everywhere(mask.flatten(1).any(1))
         require(some, f"{name}: mask {tuple(mask.shape)} is False everywhere on a surface")
@@ -76,7 +80,7 @@ def within_mask(name: str, fields: Fields) -> Fields:
         trust = None if trust is None else torch.where(mask, trust, 0)
     if anchor is not None and trust is not None:
         anchor = torch.where(trust > 0, anchor, 0)
-    return Fields(gradient, mask, weight, anchor, trust, steps, on_edges)
+    return fields._replace(gradient=gradient, weight=weight, anchor=anchor, anchor_weight=trust)
 
 
 def edge_fields(name: str, slopes: Tensor, trust: Tensor | None, fields: Fields) -> Fields:
@@ -105,6 +109,15 @@ def check_values(name: str, fields: Fields) -> None:
                 raise ValueError(f"{name}: {label} {tuple(field.shape)} is not finite{inside}")
             if label.endswith("weight") and not holds_everywhere(field >= 0):
                 raise ValueError(f"{name}: {label} {tuple(field.shape)} is negative{inside}")
+
+
+def on_torus(name: str, fields: Fields) -> Fields:
+    """The fields of a surface that repeats, once they are found to allow it."""
+    r = fields.anchor_weight
+    if r is not None and r[0].numel() > 1:
+        shape = tuple(r.shape)
+        raise ValueError(f"{name}: takes one anchor_weight per surface with boundary='periodic', {shape} is given")
+    return fields._replace(boundary="periodic")
 
 
 def fit_field(

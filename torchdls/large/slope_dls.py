@@ -26,7 +26,7 @@ from torch import Tensor
 
 from torchdls._files import Array, as_tensor
 from torchdls.integrators import SlopeDLS
-from torchdls.integrators.slope_dls.runs import blended, slow_period
+from torchdls.integrators.slope_dls.runs import Grid, blended, slow_period
 from torchdls.integrators.slope_dls.waves import share_followed, slow_factors, slow_modes
 from torchdls.large.transform import (
     Passes,
@@ -127,7 +127,7 @@ def _smooth(
         passes.say(f"row {k + 1} of {len(windows[0])}, {len(windows[1])} tiles")
         for across in windows[1]:
             gradient = passes.field.slopes(down.pixels, across.pixels)[None]
-            start, height = blended(integrator.exact_runs, gradient, level, steps, guard)
+            start, height = blended(integrator.exact_runs, gradient, level, Grid(steps), guard)
             weight = (down.weight[:, None] * across.weight).to(gradient)
             change[down.pixels, across.pixels] += a.adjoint(weight * a(height - start))[0, 0].numpy()
 

@@ -106,6 +106,12 @@ def edge_slopes(
     return torch.where(live, v, 0), torch.where(live, hi * w, 0)
 
 
+def wrapped_edge_slopes(gradient: Tensor) -> Tensor:
+    """`edge_slopes` of equal trust on a torus: (N, 2, H, W), the last edges lead from the last pixels to the first."""
+    gx, gy = gradient.split(1, -3)
+    return torch.cat([gx + gx.roll(-1, -1), gy + gy.roll(-1, -2)], -3) * 0.5
+
+
 def mean_trust(trust: Tensor) -> Tensor:
     """(N, 1, 1, 1) mean of the trusts (N, C, H, W) that are positive; 1 where none is."""
     largest = trust.amax((-3, -2, -1), keepdim=True)
@@ -263,6 +269,12 @@ def cell_curl(v: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -> Tensor
     """(N, H - 1, W - 1): sums of the slopes v, times their lengths, around each cell of 2 x 2 pixels."""
     x, y = v[:, 0, :, :-1] * pixel_size[0], v[:, 1, :-1] * pixel_size[1]
     return x[:, :-1] - x[:, 1:] + y[:, :, 1:] - y[:, :, :-1]
+
+
+def wrapped_cell_curl(v: Tensor, pixel_size: tuple[float, float]) -> Tensor:
+    """(N, H, W): `cell_curl` on a torus."""
+    x, y = v[:, 0] * pixel_size[0], v[:, 1] * pixel_size[1]
+    return x - x.roll(-1, -2) + y.roll(-1, -1) - y
 
 
 def cell_edges(field: Tensor) -> Tensor:

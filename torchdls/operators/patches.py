@@ -26,14 +26,19 @@ class Patches:
                                                 . . . . . . [6 7 8 9] .
                                                 . . . . . . . [7 8 9 10]      the extra one
 
+    With `wrap` the image repeats: patches reach over its last row and column to the first, all on the one grid, and
+    every pixel lies in equally many.
+
     Patches are numbered row by row over the grid of `grid(shape)`; a patch is flattened row by row, as in `F.unfold`.
 
     Args:
         size: rows and columns of a patch, or one number for both.
         stride: step between patches along rows and columns, or one number for both; at most the size.
+        wrap: the image repeats; then the stride divides the size, and the sides of the image.
 
     Raises:
-        ValueError: a size or stride is not a positive integer, or a stride exceeds its size (pixels would be left out).
+        ValueError: a size or stride is not a positive integer, a stride exceeds its size (pixels would be left out),
+            or does not divide it where patches wrap.
 
     Example:
         >>> patches = torchdls.Patches(4, stride=2)
@@ -46,6 +51,7 @@ class Patches:
 
     size: int | tuple[int, int] = 8
     stride: int | tuple[int, int] = 2
+    wrap: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "size", _pair("size", self.size))
@@ -53,6 +59,10 @@ class Patches:
         if any(s > p for s, p in zip(self._stride, self._size, strict=True)):
             raise ValueError(
                 f"stride: {self._stride} exceeds the patch size {self._size} and would leave pixels uncovered"
+            )
+        if self.wrap and any(p % s for s, p in zip(self._stride, self._size, strict=True)):
+            raise ValueError(
+                f"stride: {self._stride} does not divide the patch size {self._size}; patches that wrap need it"
             )
 
     @property
@@ -73,6 +83,13 @@ class Patches:
         h, w = shape[-2:]
         if not self.fit(shape):
             raise ValueError(f"image of {h} x {w} pixels is smaller than a patch of {self._size[0]} x {self._size[1]}")
+        if self.wrap:
+            down, across = self._stride
+            if h % down or w % across:
+                raise ValueError(
+                    f"image of {h} x {w} pixels: patches that wrap need sides that the stride {self._stride} divides"
+                )
+            return h // down, w // across
         rows, columns = ((m - p + s - 1) // s + 1 for m, p, s in zip((h, w), self._size, self._stride, strict=True))
         return rows, columns
 
@@ -80,9 +97,10 @@ class Patches:
         """Whether an image of shape (.., H, W) holds a patch."""
         return all(m >= p for m, p in zip(shape[-2:], self._size, strict=True))
 
-    def tile(self, shape: Sequence[int]) -> bool:
-        """Whether the patches of an image of shape (.., H, W) lie side by side: every pixel is in one of them."""
-        return self.stride == self.size and all(m % p == 0 for m, p in zip(shape[-2:], self._size, strict=True))
+    def even(self, shape: Sequence[int]) -> bool:
+        """Whether every pixel of an image of shape (.., H, W) is in equally many patches: side by side, or wrapped."""
+        beside = self.stride == self.size and all(m % p == 0 for m, p in zip(shape[-2:], self._size, strict=True))
+        return self.wrap or beside
 
     def touching(self, axis: int, length: int, low: int, high: int) -> tuple[slice, slice]:
         """Pixels and numbers of the patches that hold a pixel from `low` to `high`, along an axis of `length` pixels.
@@ -130,10 +148,17 @@ class Patches:
         fits = x.ndim == 3 and x.shape[1:] == (self.n_pixels, rows * columns)
         require(fits, f"Patches: x {tuple(x.shape)} given, {needed}")
 
+    @property
+    def _reach(self) -> tuple[int, int]:
+        """Pixels by which wrapped patches reach beyond the last row and column."""
+        return self._size[0] - self._stride[0], self._size[1] - self._stride[1]
+
     # Patches lie in memory one after the other, so that a column of the (n, L) matrix is contiguous: products with few
     # atoms stream through them, and the patches that use an atom can be gathered.
 
     def _gather(self, z: Tensor, onto: Tensor | None = None) -> Tensor:
+        if self.wrap:
+            return Patches(self.size, self.stride)._gather(_extended(z, self._reach), onto)
         rows, columns = self.grid(z.shape)
         x = z.new_empty(z.shape[0], rows * columns, self.n_pixels).mT if onto is None else onto
         grid = x.mT.unflatten(1, (rows, columns)).unflatten(3, self._size)
@@ -146,6 +171,10 @@ class Patches:
         return x
 
     def _scatter(self, x: Tensor, size: tuple[int, int]) -> Tensor:
+        if self.wrap:
+            down, across = self._reach
+            whole = Patches(self.size, self.stride)._scatter(x, (size[0] + down, size[1] + across))
+            return _folded(whole, self._reach)
         grid = x.mT.unflatten(1, self.grid(size)).unflatten(3, self._size)
         z = x.new_zeros(x.shape[0], 1, *size)
         for patches, pixels in self._blocks(size):
@@ -187,6 +216,8 @@ class Patches:
 
     def _axis_coverage(self, m: int, axis: int, dtype: torch.dtype, device: torch.device | str) -> Tensor:
         size = self._size[axis]
+        if self.wrap:
+            return torch.full((m,), size // self._stride[axis], dtype=dtype, device=device)
         starts = torch.tensor(
             [s.start + i * self._stride[axis] for s, k in self._spans_of(m, axis) for i in range(k)],
             device="cpu",
@@ -202,6 +233,20 @@ class Patches:
         reach = (regular - 1) * stride + size
         spans = [(slice(0, reach), regular)]
         return spans if reach == m else [*spans, (slice(m - size, m), 1)]
+
+
+def _extended(z: Tensor, reach: tuple[int, int]) -> Tensor:
+    """The first rows and columns of a repeating image once more behind its last ones."""
+    z = torch.cat([z, z[..., : reach[0], :]], -2)
+    return torch.cat([z, z[..., : reach[1]]], -1)
+
+
+def _folded(z: Tensor, reach: tuple[int, int]) -> Tensor:
+    """The transpose of `_extended`; writes to z."""
+    h, w = z.shape[-2] - reach[0], z.shape[-1] - reach[1]
+    z[..., : reach[1]] += z[..., w:]
+    z[..., : reach[0], :] += z[..., h:, :]
+    return z[..., :h, :w].contiguous()
 
 
 class _Extract(torch.autograd.Function):

@@ -254,7 +254,7 @@ def test_dirichlet_is_no_data_term():
 @pytest.mark.parametrize(
     "build, message",
     [
-        (lambda: LeastSquares(boundary="periodic"), "boundary='periodic' is unknown"),
+        (lambda: LeastSquares(boundary="even"), "boundary='even' is unknown"),
         (lambda: FrankotChellappa("even"), "extension='even' is unknown"),
         (lambda: HornBrooks(relaxation=2.0), "relaxation=2.0"),
         (lambda: HornBrooks(max_iter=0), "max_iter=0"),

@@ -302,9 +302,9 @@ def test_patches_side_by_side_need_no_iterative_solve(given, monkeypatch):
     if given:
         fields = {"anchor": random_field(2, 1, 24, 16, seed=1), "anchor_weight": given["anchor"]}
     dls = DLS(patch_size=4, stride=4, n_atoms=16, lam=0.05, mu=0.3, n_iter=3, tol=0.0, height_step=Exact(1e-12))
-    assert not Patches(4, 4).tile((24, 15))
+    assert not Patches(4, 4).even((24, 15))
     with monkeypatch.context() as patch:
-        patch.setattr(Patches, "tile", lambda *_: False)
+        patch.setattr(Patches, "even", lambda *_: False)
         expected = dls.solve(g, **fields)
     with monkeypatch.context() as patch:
         patch.setattr("torchdls.solvers.poisson.conjugate_gradients", None)

@@ -188,8 +188,8 @@ def test_bad_settings_of_parts_are_named(make, message):
         make()
 
 
-def test_it_has_at_most_fifteen_options():
-    assert len(inspect.signature(DLS).parameters) <= 15
+def test_it_has_at_most_sixteen_options():
+    assert len(inspect.signature(DLS).parameters) <= 16
 
 
 @pytest.mark.parametrize("given", [{}, {"mask": MASKS["ring_and_islands"](H, W)}], ids=["plain", "mask"])

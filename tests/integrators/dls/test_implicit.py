@@ -147,7 +147,10 @@ def test_second_derivative_and_transforms() -> None:
     [
         ({"derivative": "implicit", "learn": "each"}, "take 'unroll' .* or 'frozen_dictionary'"),
         ({"derivative": "frozen_dictionary"}, "take 'implicit'"),
-        ({"learner": FixedDictionary("firm")}, "needs a data term that is one quadratic, and hard or soft thresholds"),
+        (
+            {"learner": FixedDictionary("firm")},
+            "needs a data term that is one quadratic, free borders, and hard or soft",
+        ),
         (
             {"derivative": "frozen_dictionary", "learn": "each", "dictionary": torch.nn.Parameter(torch.eye(9))},
             "gives a trained dictionary no derivative",

@@ -12,7 +12,7 @@ from torchdls.integrators.slope_dls.bases import Places
 from torchdls.integrators.slope_dls.blend import blend_by_waves, least_in_simplex, signs, sure_weights
 from torchdls.integrators.slope_dls.known import Known
 from torchdls.integrators.slope_dls.lines import atoms
-from torchdls.integrators.slope_dls.runs import FOUR, HOLED, Run, smooth
+from torchdls.integrators.slope_dls.runs import FOUR, HOLED, Grid, Run, smooth
 from torchdls.integrators.slope_dls.waves import cautious, shrink_slow_waves
 from torchdls.noise import height_noise
 from torchdls.operators import GradientOperator, dct2, idct2
@@ -382,15 +382,17 @@ def test_a_single_row_is_integrated_as_it_is(shape):
     torch.testing.assert_close(SlopeDLS()(gradient), LeastSquares()(gradient))
 
 
-def test_derivative_of_the_blend_is_that_of_its_parts():
+@pytest.mark.parametrize("boundary", ["neumann", "periodic"])
+def test_derivative_of_the_blend_is_that_of_its_parts(boundary):
     """By finite differences of the same blend with its weights held: scaling data and noise scales the surface."""
     gradient = add_noise(SURFACES["tent"](24, dtype=torch.float64).gradient, 5, seeded(1))
     sigma = torch.tensor([0.2], dtype=torch.float64)
     runs = [Run(n_iter=2), Run(sizes=(4, 8), weights="equal", n_iter=2)]
-    _, slope = torch.autograd.functional.jvp(lambda g: smooth(runs, g, sigma, (1.0, 1.0)), gradient, gradient)
+    grid = Grid((1.0, 1.0), boundary)
+    _, slope = torch.autograd.functional.jvp(lambda g: smooth(runs, g, sigma, grid), gradient, gradient)
     step = 1e-6
-    ends = [smooth(runs, gradient * (1 + s), sigma * (1 + s), (1.0, 1.0)) for s in (step, -step)]
-    _, of_noise = torch.autograd.functional.jvp(lambda s: smooth(runs, gradient, s, (1.0, 1.0)), sigma, sigma)
+    ends = [smooth(runs, gradient * (1 + s), sigma * (1 + s), grid) for s in (step, -step)]
+    _, of_noise = torch.autograd.functional.jvp(lambda s: smooth(runs, gradient, s, grid), sigma, sigma)
     torch.testing.assert_close(slope + of_noise, (ends[0] - ends[1]) / (2 * step), atol=1e-6, rtol=1e-5)
 
 

@@ -12,6 +12,7 @@ from torchdls.integrators.base import Fields, IntegrationResult, Integrator
 from torchdls.integrators.classic.dirichlet import solve_dirichlet
 from torchdls.integrators.data_term import Quadratic
 from torchdls.solvers import SolveResult, direct_result, integrate_direct, solve
+from torchdls.solvers.periodic import solve_periodic
 
 
 class LeastSquares(Integrator):
@@ -26,10 +27,14 @@ class LeastSquares(Integrator):
     are known: they are those of the anchor, exactly and whatever its weight, and 0 where there is none. On a full
     rectangle with equal weights this is one direct solve by sine transforms.
 
+    With `boundary="periodic"` the surface repeats, as a texture that is tiled: the last column is beside the first, the
+    last row above the first, and the height meets itself there without a seam. A mean slope, which no such surface has,
+    is dropped. One direct solve by Fourier transforms; takes no mask and no weight, and one anchor weight per surface.
+
     Args:
         tol: relative residual at which a surface stops.
         max_iter: limit of conjugate-gradient steps; a `ConvergenceWarning` says when it was reached.
-        boundary: "neumann" (free) or "dirichlet" (known heights).
+        boundary: "neumann" (free), "dirichlet" (known heights) or "periodic" (tileable).
         pixel_size: (dx, dy) or one number; heights come out in its unit.
 
     Raises:
@@ -52,7 +57,7 @@ class LeastSquares(Integrator):
         self,
         tol: float = 1e-6,
         max_iter: int = 500,
-        boundary: Literal["neumann", "dirichlet"] = "neumann",
+        boundary: Literal["neumann", "dirichlet", "periodic"] = "neumann",
         *,
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
@@ -61,12 +66,17 @@ class LeastSquares(Integrator):
         check_whole(type(self).__name__, max_iter=max_iter)
         if not tol > 0 or not max_iter > 0:
             raise ValueError(f"LeastSquares: tol={tol!r} and max_iter={max_iter!r} given, both must be positive")
-        if boundary not in ("neumann", "dirichlet"):
-            raise ValueError(f"LeastSquares: boundary={boundary!r} is unknown; choose from 'neumann', 'dirichlet'")
+        known = ("neumann", "dirichlet", "periodic")
+        if boundary not in known:
+            raise ValueError(
+                f"LeastSquares: boundary={boundary!r} is unknown; choose from {', '.join(map(repr, known))}"
+            )
         self.tol = tol
         self.max_iter = max_iter
         self.boundary = boundary
-        self._steady = True if boundary == "neumann" else None  # the quadratic does not hold a border
+        if boundary == "periodic":
+            self.accepts = frozenset({"anchor"})
+        self._steady = None if boundary == "dirichlet" else True  # the quadratic does not hold a border
         self._reads_edges = boundary == "neumann"
 
     def _integrate(self, fields: Fields) -> Tensor:
@@ -95,7 +105,10 @@ class LeastSquares(Integrator):
             return direct_result(integrate_direct(fields.gradient, fields.steps))
         if self.boundary == "dirichlet":
             return solve_dirichlet(fields, tol=self.tol, max_iter=self.max_iter, z0=z0)
-        v, w, _ = self._data_term(fields)
+        if self.boundary == "periodic":
+            v = self._data_term(fields).v
+            return direct_result(solve_periodic(v, fields.anchor, fields.anchor_weight, fields.steps))
+        v, w, *_ = self._data_term(fields)
         return solve(
             v,
             w,

@@ -28,10 +28,12 @@ from torch import Tensor
 from torchdls._tracing import is_concrete
 from torchdls.integrators.fields import Fields, has_even_trust
 from torchdls.noise import averaging_error, height_noise
-from torchdls.operators import dct2, edge_slopes, idct2
-from torchdls.operators.edges import mean_trust
+from torchdls.operators import edge_slopes
+from torchdls.operators.edges import mean_trust, wrapped_edge_slopes
+from torchdls.operators.modes import from_modes, to_modes
 from torchdls.selection import band_means, within_noise
 from torchdls.solvers import solve
+from torchdls.solvers.periodic import solve_periodic
 
 # On sixteen surfaces of 96 and 200 pixels a side, from 1 to 60 dB; checked on other draws and sizes, and with masks
 # and weights (benchmarks/quality/gains.py, conditions.py). A figure in which all modes count alike (p = 1) would
@@ -60,11 +62,12 @@ def guard(height: Tensor, reference: Tensor, codes: Tensor, fields: Fields, nois
     sigma = torch.where(noise.isnan(), 0, noise)
     exact = has_even_trust(fields)
     variance = relative_variance(fields, exact)
-    difference = dct2(height - reference)
-    within = within_noise(difference, variance, sigma)
+    difference = to_modes(height - reference, fields.boundary)
+    within = within_noise(difference, variance, sigma, boundary=fields.boundary)
     share = followed(difference.detach(), within.detach(), variance, codes.detach(), sigma.detach())
     share = torch.where(noise.isnan(), 1, share)
-    target = torch.where(exact & ~noise.isnan()[:, None, None, None], reference + idct2(within), height)
+    given_back = reference + from_modes(within, fields.boundary)
+    target = torch.where(exact & ~noise.isnan()[:, None, None, None], given_back, height)
     return reference + share[:, None, None, None] * (target - reference), share
 
 
@@ -106,17 +109,17 @@ def relative_variance(fields: Fields, exact: Tensor) -> Tensor:
         (H, W), or (N, 1, H, W) where it is not exact for all.
     """
     like = fields.gradient
-    S = height_noise((like.shape[-2], like.shape[-1]), like, fields.steps)
+    S = height_noise((like.shape[-2], like.shape[-1]), like, fields.steps, fields.boundary)
     if is_concrete(exact) and bool(exact.all()):
         return S
-    energy = sum(dct2(z).square() for z in _noise_heights(fields)) / _SAMPLES
-    ratio = band_means(energy / torch.where(S > 0, S, 1))
+    energy = sum(to_modes(z, fields.boundary).square() for z in _noise_heights(fields)) / _SAMPLES
+    ratio = band_means(energy / torch.where(S > 0, S, 1), fields.boundary)
     return torch.where(exact, S, S * ratio)
 
 
 def _noise_heights(fields: Fields) -> list[Tensor]:
     """Least-squares heights of samples of the noise, the same for every surface; anchors are met without it."""
-    gradient, mask, weight, anchor, r, steps, on_edges = fields
+    gradient, mask, weight, anchor, r, steps, on_edges, boundary = fields
     error = scale = None
     if weight is not None:
         error = None if on_edges else averaging_error(gradient, mask, weight, steps)
@@ -128,6 +131,9 @@ def _noise_heights(fields: Fields) -> list[Tensor]:
     for _ in range(_SAMPLES):
         n = torch.randn(gradient.shape[1:], generator=generator, dtype=torch.float64, device="cpu")
         n = n.to(gradient).expand_as(gradient)
+        if boundary == "periodic":
+            heights.append(solve_periodic(wrapped_edge_slopes(n), rest, r, steps))
+            continue
         n = n if scale is None else n * scale
         n = n if mask is None or on_edges else torch.where(mask, n, 0)
         v, w = (n, weight) if on_edges else edge_slopes(n, mask, weight, error=error)

@@ -27,6 +27,7 @@ from torchdls.integrators.dls.settings import (
     Derivative,
     HeightStep,
     Learn,
+    check_boundary,
     check_dictionary,
     check_run,
     check_strength,
@@ -41,6 +42,7 @@ from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.settling import run_until_settled
 from torchdls.noise import edge_noise_if_told, noise_if_told
 from torchdls.operators import Patches
+from torchdls.operators.modes import Boundary
 from torchdls.solvers import remove_free_constants
 
 # lam is a plateau from here on; one standard deviation of the noise is safe on textured relief and on smooth surfaces
@@ -139,6 +141,9 @@ class DLS(Iterative[DLSResult]):
             of one linear solve; `Implicit(tol=...)` says how exact. "frozen_dictionary": the same as if the learned
             dictionary did not move, an approximation. "none". "auto" is "implicit" where that is exact and "unroll"
             elsewhere.
+        boundary: "neumann" (free borders), or "periodic" for a surface that repeats, as in `LeastSquares`: patches
+            reach over the borders, and the height is tileable. The stride then divides the patches and the sides of the
+            field; takes no mask, no weight and one anchor weight per surface, and goes with `LeastSquares` alone.
         pixel_size: (dx, dy) or one number; heights come out in its unit.
 
     Raises:
@@ -178,11 +183,16 @@ class DLS(Iterative[DLSResult]):
         select: Select = "auto",
         tol: float = 1e-3,
         derivative: Derivative = "auto",
+        boundary: Boundary = "neumann",
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(pixel_size=pixel_size)
-        self.patches = Patches(patch_size, stride)
-        self.data_term = LeastSquares() if data_term is None else data_term
+        check_boundary(boundary, data_term, select)
+        self.boundary = boundary
+        if boundary == "periodic":
+            self.accepts = frozenset({"anchor"})
+        self.patches = Patches(patch_size, stride, wrap=boundary == "periodic")
+        self.data_term = LeastSquares(boundary=boundary) if data_term is None else data_term
         if not isinstance(self.data_term, Integrator):
             raise TypeError(f"DLS: data_term is a {type(data_term).__name__}, an Integrator is needed")
         if self.data_term._steady is None:
@@ -200,7 +210,7 @@ class DLS(Iterative[DLSResult]):
         check_dictionary(initial, self.patches)
         register_setting(self, "dictionary", initial)
         self.derivative = derivative
-        rule, steady = self._settings.threshold, bool(self.data_term._steady)
+        rule, steady = self._settings.threshold, bool(self.data_term._steady) and boundary == "neumann"
         self._derivative = choose_derivative(derivative, self.learn, rule, steady, initial)
 
     def _to_pixel_size(self, result: DLSResult) -> DLSResult:
@@ -303,7 +313,7 @@ class DLS(Iterative[DLSResult]):
         data = self.data_term._data_term(fields)
         schedule = self.mu if isinstance(self.mu, tuple) else None
         if mask is None:
-            if self.patches.tile(shape):  # one number, with which the height is one direct solve
+            if self.patches.even(shape):  # one number, with which the height is one direct solve
                 coverage = coverage[..., :1, :1]
             return Problem(fields, self.patches, coverage, None, data, noise, lam, mu, schedule)
         valid = (self.patches.extract(mask.to(gradient.dtype)) > 0).expand(N, -1, -1)
@@ -318,7 +328,7 @@ class DLS(Iterative[DLSResult]):
         if fields.on_edges:
             level, told = edge_noise_if_told(fields.gradient, weight, fields.steps)
         else:
-            level, told = noise_if_told(fields.gradient, fields.mask, weight, fields.steps)
+            level, told = noise_if_told(fields.gradient, fields.mask, weight, fields.steps, fields.boundary)
         return torch.where(told, level, math.nan)
 
     @property

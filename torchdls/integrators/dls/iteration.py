@@ -25,6 +25,7 @@ from torchdls.integrators.dls.problem import Problem, State, drop_costly_codes, 
 from torchdls.integrators.dls.settings import Learn
 from torchdls.operators import GradientOperator
 from torchdls.solvers import harmonic_extension, solve
+from torchdls.solvers.periodic import solve_periodic
 
 
 class Settings(NamedTuple):
@@ -110,19 +111,21 @@ def update_height(problem: Problem, z: Tensor, folded: Tensor, settings: Setting
     if fields.anchor is not None and fields.anchor_weight is not None:
         weight, pull = weight + fields.anchor_weight, pull + fields.anchor_weight * fields.anchor
     if isinstance(settings.height_step, Exact):
+        if fields.boundary == "periodic":
+            return solve_periodic(v, pull / torch.where(weight > 0, weight, 1), weight, fields.steps)
         anchor, tol = pull / torch.where(weight > 0, weight, 1), settings.height_step.tol
         return solve(v, w, anchor, weight, tol=tol, z0=z.detach(), pixel_size=fields.steps).height
-    return proximal_steps(z, v, w, weight, pull, fields.steps, settings.height_step)
+    a = GradientOperator("forward", fields.steps, fields.boundary)
+    return proximal_steps(z, v, w, weight, pull, a, settings.height_step)
 
 
 def proximal_steps(
-    z: Tensor, v: Tensor, w: Tensor | None, weight: Tensor, pull: Tensor, steps: tuple[float, float], how: Proximal
+    z: Tensor, v: Tensor, w: Tensor | None, weight: Tensor, pull: Tensor, a: GradientOperator, how: Proximal
 ) -> Tensor:
     """(nproxupdate): z <- prox_{tau g}(z - tau grad f(z)), with f = 1/2 ||A z - v||^2 and tau = 1/||A||^2.
 
     Accelerated steps start from z ahead of where the last step ended (Nesterov).
     """
-    a = GradientOperator("forward", steps)
     stiffest = z.new_ones(()) if w is None else w.amax((-3, -2, -1), keepdim=True).clamp(min=1)
     tau = 1 / (a.norm_bound**2 * stiffest)
     ahead, pace = z, 1.0

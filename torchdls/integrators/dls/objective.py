@@ -39,7 +39,7 @@ def dls_objective(
         codes: (N, K, L).
         lam: a number or (N,).
         mu: a number or (N,).
-        patches: the patches; `Patches(8, 2)` by default.
+        patches: the patches; `Patches(8, 2)` by default. Where they wrap, the surface repeats.
         mask: (N, 1, H, W) bool.
         weight: (N, 1 or 2, H, W).
 
@@ -59,7 +59,7 @@ def dls_objective(
     """
     patches = Patches() if patches is None else patches
     check_together("dls_objective", gradient=gradient, height=height, dictionary=dictionary, codes=codes)
-    fields = LeastSquares()._check_fields(gradient, mask, weight)
+    fields = LeastSquares(boundary="periodic" if patches.wrap else "neumann")._check_fields(gradient, mask, weight)
     check_fit("dls_objective", "height", height, fields.gradient, "gradient", channels=(1,))
     if codes.ndim != 3 or dictionary.ndim != 3:
         shapes = f"dictionary {tuple(dictionary.shape)} and codes {tuple(codes.shape)}"

@@ -33,6 +33,18 @@ def check_run(n_iter: int, tol: float, mu: object) -> None:
         raise ValueError(f"DLS: mu has {len(mu)} values for n_iter={n_iter} iterations")
 
 
+def check_boundary(boundary: object, data_term: object, select: object) -> None:
+    """ValueError for an unknown boundary, one that differs from the data term's, or one without a predicted risk."""
+    if boundary not in ("neumann", "periodic"):
+        raise ValueError(f"DLS: boundary={boundary!r} is unknown; choose from 'neumann', 'periodic'")
+    own = getattr(data_term, "boundary", boundary)
+    if own != boundary and own != "dirichlet":  # that one has no data term at all, which is said elsewhere
+        name = type(data_term).__name__
+        raise ValueError(f"DLS: boundary={boundary!r} does not go with data_term {name}, whose boundary is {own!r}")
+    if boundary == "periodic" and select is True:
+        raise ValueError("DLS: select=True predicts the risk with free borders, not with boundary='periodic'")
+
+
 def choose_height_step(height_step: HeightStep) -> Exact | Proximal:
     """The height step that was named, or the one given."""
     return meant("height_step", height_step, HEIGHT_STEPS, (Exact, Proximal))
@@ -47,7 +59,7 @@ def choose_derivative(
         derivative: what was asked for.
         learn: whether the dictionary is learned.
         threshold: rule of the codes.
-        steady: the data term is one quadratic, whatever the height.
+        steady: the data term is one quadratic, whatever the height, and the borders are free.
         dictionary: the initial dictionary.
     """
     possible = steady and threshold != "firm"
@@ -57,7 +69,7 @@ def choose_derivative(
         return found
     asked = f"DLS: derivative={derivative!r}"
     if not possible:
-        what = "a data term that is one quadratic, and hard or soft thresholds"
+        what = "a data term that is one quadratic, free borders, and hard or soft thresholds"
         raise ValueError(f"{asked} needs {what}; take derivative='unroll'")
     if found.frozen_dictionary == (learn == "fixed"):
         other = "'implicit'" if found.frozen_dictionary else "'unroll' (exact) or 'frozen_dictionary'"

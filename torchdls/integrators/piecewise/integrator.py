@@ -148,7 +148,7 @@ class Piecewise(Iterative[PiecewiseResult]):
 
     def _data_term(self, fields: Fields) -> Quadratic:
         """One quadratic, once the search has found which edges hold and by how much the others jump."""
-        v, w, steps = self._held(fields)[0]
+        v, w, steps, _ = self._held(fields)[0]
         return Quadratic(v.to(fields.gradient.dtype), None if w is None else w.to(fields.gradient.dtype), steps)
 
     @property
@@ -169,7 +169,7 @@ class Piecewise(Iterative[PiecewiseResult]):
 
     def _iterate(self, fields: Fields, callback: Callback | None = None) -> PiecewiseResult:
         """The search, the last solve, and what it says of pieces."""
-        (v, w, steps), noise, (cut, smooth, pieces, tied) = self._held(fields)
+        (v, w, steps, _), noise, (cut, smooth, pieces, tied) = self._held(fields)
         anchor, r = (None if f is None else f.double() for f in (fields.anchor, fields.anchor_weight))
         height = solve(v, w, anchor, r, tol=self.solve_tol, pixel_size=steps).height.to(fields.gradient.dtype)
         even = smooth & ~((noise > 0) & follows_tilt(self._scale * fields.gradient, _inside(fields)))

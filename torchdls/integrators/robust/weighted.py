@@ -74,13 +74,13 @@ class WeightedLeastSquares(LeastSquares):
 
     def _solve_fields(self, fields: Fields, z0: Tensor | None = None) -> SolveResult:
         """The solve and how it went, from a warm start z0."""
-        v, w, _ = self._data_term(fields)
+        v, w, *_ = self._data_term(fields)
         anchors = fields.anchor, fields.anchor_weight
         return solve(v, w, *anchors, tol=self.tol, max_iter=self.max_iter, z0=z0, pixel_size=fields.steps)
 
     def _data_term(self, fields: Fields) -> Quadratic:
         """Slopes v and trusts q w; they do not depend on the height."""
-        v, w, steps = super()._data_term(fields)
+        v, w, steps, _ = super()._data_term(fields)
         w = present_edges(v) if w is None else w
         return Quadratic(v, w * self._trust(fields), steps)
 
@@ -90,7 +90,7 @@ class WeightedLeastSquares(LeastSquares):
         g = fields.gradient
         valid = torch.ones_like(g, dtype=torch.bool) if fields.weight is None else (fields.weight > 0).expand_as(g)
         valid = valid if fields.mask is None else valid & fields.mask
-        v, w, _ = super()._data_term(fields)
+        v, w, *_ = super()._data_term(fields)
         curl, cells = cell_curl(v, fields.steps), complete_cells((present_edges(v) if w is None else w) > 0)
         noise = masked_median(curl.abs().flatten(1), cells.flatten(1)) / NORMAL_MEDIAN
         kappa = self.threshold * torch.maximum(noise, least_slope(g, valid))

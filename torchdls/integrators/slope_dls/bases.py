@@ -13,6 +13,7 @@ from torch import Tensor
 from torchdls.integrators.slope_dls.lines import Line, atoms, inside
 from torchdls.noise import height_noise
 from torchdls.operators.cosine import cosine_matrix
+from torchdls.operators.modes import mode_sines
 from torchdls.operators.tables import table
 
 _GOLDEN = 0.381966  # of a stride: the shifts of the patch grid from one iteration to the next, never in step
@@ -45,6 +46,20 @@ class Places:
         """The grid of an iteration."""
         stride = max(1, size // 2)
         return cls(shape, size, round(iteration * _GOLDEN * stride) % stride, smooth)
+
+    def around(self) -> tuple[Places, Tensor, Tensor]:
+        """The same grid on a torus, laid out flat.
+
+        Returns:
+            Patches of an image that holds every patch of the torus once, and the row and the column of the torus that
+            each of its rows and columns is.
+        """
+        stride, positions = max(1, self.size // 2), []
+        for n, offset in zip(self.shape, self.offsets, strict=True):
+            length = (-(-n // stride) - 1) * stride + self.size
+            positions.append((torch.arange(length, device="cpu") - offset) % n)
+        rows, columns = positions
+        return Places((len(rows), len(columns)), self.size, 0, self.smooth), rows, columns
 
     @property
     def offsets(self) -> tuple[int, int]:
@@ -143,6 +158,11 @@ class Places:
         found: Tensor = _far_noise(self.size, self.smooth, tuple(steps), like=like)
         return found
 
+    def torus_noise(self, like: Tensor, steps: tuple[float, float], turned: bool) -> Tensor:
+        """`noise` on a torus, where it is the same in all patches: (size, 1, 2, 1, 1, size)."""
+        found: Tensor = _torus_noise(self.shape, self.size, self.smooth, tuple(steps), turned, like=like)
+        return found
+
 
 @table
 def _far_noise(size: int, smooth: bool, steps: tuple[float, float]) -> Tensor:
@@ -181,11 +201,29 @@ def _build_noise(
     slope_x, slope_y = slope_x / steps[0], slope_y / steps[1]
     in_x = value_y.square() @ variance @ slope_x.square().mT
     in_y = slope_y.square() @ variance @ value_x.square().mT
-    if turned:
-        shared, mean = (slope_y * value_y) @ variance @ (slope_x * value_x).mT, (in_x + in_y) / 2
+    shared = (slope_y * value_y) @ variance @ (slope_x * value_x).mT if turned else None
+    return _by_patch(in_x, in_y, shared, size)
+
+
+def _by_patch(in_x: Tensor, in_y: Tensor, shared: Tensor | None, size: int) -> Tensor:
+    """Standard deviations from variances of the slopes, or, with what they share, of those along the diagonals."""
+    if shared is not None:
+        mean = (in_x + in_y) / 2
         in_x, in_y = mean + shared, mean - shared
     by_patch = torch.stack([in_x, in_y]).clamp(min=0).sqrt().unflatten(-1, (-1, size)).unflatten(-3, (-1, size))
     return by_patch.movedim(2, 0)[:, None].contiguous()
+
+
+@table
+def _torus_noise(shape: tuple[int, int], size: int, smooth: bool, steps: tuple[float, float], turned: bool) -> Tensor:
+    double = torch.empty(0, dtype=torch.float64, device="cpu")
+    variance, basis = height_noise(shape, double, steps, "periodic"), atoms(size, smooth, like=double)
+    y, x = (torch.fft.fft(basis, n, norm="ortho").abs().square() for n in shape)
+    half_y, half_x = (2 * mode_sines(n, "periodic") / d for n, d in zip(shape, steps[::-1], strict=True))
+    slope_y, slope_x = 2 * half_y / steps[1], 2 * half_x / steps[0]  # |e^iw - 1|^2 / d^2
+    in_x, in_y = y @ variance @ (slope_x * x).mT, (slope_y * y) @ variance @ x.mT
+    # Of (e^iw - 1) / d the part that is even in w is all that slopes in x and in y share.
+    return _by_patch(in_x, in_y, (half_y * y) @ variance @ (half_x * x).mT if turned else None, size)
 
 
 def _seen(line: Line, double: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchdls.integrators.slope_dls.waves import slow_modes
 from torchdls.noise import height_noise
-from torchdls.operators import dct2, idct2
+from torchdls.operators.modes import Boundary, from_modes, to_modes
 from torchdls.operators.tables import table
 
 _PERIOD = 32.0  # of the slow waves, in pixels
@@ -38,6 +38,7 @@ def sure_weights(
     noise: Tensor,
     pixel_size: tuple[float, float] = (1.0, 1.0),
     norm: float = 0.5,
+    boundary: Boundary = "neumann",
 ) -> Tensor:
     r"""Weights w >= 0, sum w <= 1, of z_ls + sum_m w_m (z_m - z_ls) with the least predicted risk.
 
@@ -56,14 +57,15 @@ def sure_weights(
         noise: (N,) standard deviation of one gradient sample.
         pixel_size: (dx, dy).
         norm: 0 to 1.
+        boundary: "neumann" or "periodic".
 
     Returns:
         (N, M), without a derivative: a choice.
 
     Source: Stein (1981); Ramani, Blu, Unser, "Monte-Carlo SURE", IEEE TIP 17(9), 2008.
     """
-    weight = _weight(reference, pixel_size, norm)
-    D, push, change = (dct2(t.detach()) for t in (heights - reference, moved, changes - moved))
+    weight = _weight(reference, pixel_size, norm, boundary)
+    D, push, change = (to_modes(t.detach(), boundary) for t in (heights - reference, moved, changes - moved))
     return _least_risk(*_risk(D, push, change, weight, noise)).to(reference)
 
 
@@ -75,6 +77,7 @@ def blend_by_waves(
     noise: Tensor,
     pixel_size: tuple[float, float] = (1.0, 1.0),
     norm: float = 0.5,
+    boundary: Boundary = "neumann",
 ) -> Tensor:
     r"""z_ls + sum_m w_m (z_m - z_ls), with weights of their own for the slow waves (period above 32) and the others.
 
@@ -92,30 +95,31 @@ def blend_by_waves(
         noise: without a derivative.
         pixel_size: (dx, dy).
         norm: 0 to 1.
+        boundary: "neumann" or "periodic".
 
     Returns:
         (N, 1, H, W); differentiable in the heights and the reference, with the weights held fixed.
     """
-    weight = _weight(reference, pixel_size, norm)
+    weight = _weight(reference, pixel_size, norm, boundary)
     shape = (reference.shape[-2], reference.shape[-1])
-    slow = slow_modes(shape, shape, _PERIOD, reference)
-    D, push, change = dct2(heights - reference), dct2(moved), dct2(changes - moved)
+    slow = slow_modes(shape, shape, _PERIOD, reference, boundary)
+    D, push, change = (to_modes(t, boundary) for t in (heights - reference, moved, changes - moved))
     parts = slow, ~slow
     risks = [_risk(D.detach(), push, change, torch.where(part, weight, 0), noise) for part in parts]
     blends = []
     for own, other in zip(risks, reversed(risks), strict=True):
         w = _least_risk(*(a + _SHARED * b for a, b in zip(own, other, strict=True))).to(reference)
         blends.append((w.mT[:, :, None, None, None] * D).sum(0))
-    fine = torch.where(slow, 0, _weight(reference, pixel_size, 0.75))
-    expected = noise.detach().square() * torch.where(slow, 0, _weight(reference, pixel_size, -0.25)).sum()
+    fine = torch.where(slow, 0, _weight(reference, pixel_size, 0.75, boundary))
+    expected = noise.detach().square() * torch.where(slow, 0, _weight(reference, pixel_size, -0.25, boundary)).sum()
     share = (fine * blends[1].detach().square()).sum((-3, -2, -1)) / torch.where(expected > 0, expected, 1)
     share = (5 * share - 2).clamp(0, 1)[:, None, None, None]
-    return reference + idct2(torch.where(slow, blends[0], share * blends[1]))
+    return reference + from_modes(torch.where(slow, blends[0], share * blends[1]), boundary)
 
 
-def _weight(reference: Tensor, pixel_size: tuple[float, float], norm: float) -> Tensor:
+def _weight(reference: Tensor, pixel_size: tuple[float, float], norm: float, boundary: Boundary) -> Tensor:
     """(H, W) W."""
-    variance = height_noise((reference.shape[-2], reference.shape[-1]), reference, pixel_size)
+    variance = height_noise((reference.shape[-2], reference.shape[-1]), reference, pixel_size, boundary)
     return torch.where(variance > 0, torch.where(variance > 0, variance, 1).pow(-norm), 0)
 
 

@@ -94,7 +94,7 @@ class _Surface:
 
     def integrate(self, slopes: Tensor, z0: Tensor | None = None) -> Tensor:
         """The solve, from a guess."""
-        _, mask, weight, anchor, r, steps, _ = self.fields
+        _, mask, weight, anchor, r, steps, *_ = self.fields
         w = edge_slopes(self.fields.gradient, mask, weight)[1]
         guess = None if z0 is None else z0.detach()
         return solve(slopes, w, anchor, r, tol=self.tol, z0=guess, pixel_size=steps).height

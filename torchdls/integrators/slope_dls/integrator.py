@@ -18,10 +18,11 @@ from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.slope_dls.coding import Aggregate, Noise, SlopeScale, average
 from torchdls.integrators.slope_dls.holed import continued, smooth_holed
 from torchdls.integrators.slope_dls.outliers import replace_outliers
-from torchdls.integrators.slope_dls.runs import FOUR, HOLED, HOLED_QUICK, KAPPA, QUICK, Run, smooth
+from torchdls.integrators.slope_dls.runs import FOUR, HOLED, HOLED_QUICK, KAPPA, QUICK, Grid, Run, smooth
 from torchdls.noise import noise_if_told
 from torchdls.operators import GradientOperator, edge_slopes
 from torchdls.operators.edges import extend_edges
+from torchdls.operators.modes import Boundary
 from torchdls.selection import discrepancy_guard, probe, sure_guard
 from torchdls.solvers import solve
 
@@ -136,6 +137,9 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         aggregate: "plain" alone: weights of the patches in the average: "mean", or "sparsity", 1 / (1 + number of
             coefficients).
         z_tol: relative residual of the heights where no direct solve serves.
+        boundary: "neumann" (free borders), or "periodic" for a surface that repeats, as in `LeastSquares`: patches
+            reach around the torus, on which the noise of every coefficient is the same in all of them, and the height
+            is tileable. For "blend" and "quick", without masks, weights and anchors.
         pixel_size: (dx, dy) or one number; heights come out in its unit.
 
     Raises:
@@ -168,6 +172,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         robust: bool = False,
         aggregate: Aggregate | None = None,
         z_tol: float = 1e-5,
+        boundary: Boundary = "neumann",
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(pixel_size=pixel_size)
@@ -189,6 +194,14 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
             check_numbers("SlopeDLS", sigma=sigma)
         if sigma is not None and not bool((torch.as_tensor(sigma) >= 0).all()):
             raise ValueError(f"SlopeDLS: sigma={sigma!r} given, at least 0 is needed")
+        if boundary not in ("neumann", "periodic"):
+            raise ValueError(f"SlopeDLS: boundary={boundary!r} is unknown; choose from 'neumann', 'periodic'")
+        if boundary == "periodic" and (recipe == "plain" or guard == "sure" or robust or getattr(sigma, "ndim", 0) > 1):
+            other = "recipe='plain', guard='sure', robust=True or a map of sigma"
+            raise ValueError(f"SlopeDLS: boundary='periodic' does not go with {other}")
+        self.boundary = boundary
+        if boundary == "periodic":
+            self.accepts = frozenset()
         self.patch_sizes = None if patch_sizes is None else tuple(patch_sizes)
         self.tau, self.n_iter, self.learn, self.aggregate = tau, n_iter, learn, aggregate
         self.recipe, self.guard, self.robust, self.z_tol = recipe, guard, robust, z_tol
@@ -268,8 +281,8 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
     def _exact(self, fields: Fields, noise: Noise, callback: Callback | None) -> SlopeDLSResult:
         """By the runs of the recipe, on full rectangles with equal trust."""
         data = Quadratic.of(fields)
-        start = solve(edge_slopes(fields.gradient)[0], pixel_size=fields.steps).height
-        misfit = [data.cost(start)]
+        grid = Grid(fields.steps, fields.boundary)
+        misfit = [data.cost(grid.least_squares(fields.gradient))]
 
         def watch(z: Tensor) -> None:
             misfit.append(data.cost(z))
@@ -277,14 +290,14 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
                 callback(len(misfit) - 1, misfit[-1].detach())
 
         guarded = self.guard is not None
-        height = smooth(self.exact_runs, fields.gradient, noise.overall, fields.steps, guarded, watch)
+        height = smooth(self.exact_runs, fields.gradient, noise.overall, grid, guarded, watch)
         return SlopeDLSResult(height, None, None, torch.stack(misfit, 1), noise.level, height)
 
     def _plain(self, fields: Fields, noise: Noise, callback: Callback | None = None) -> SlopeDLSResult:
         recipe = replace(_Plain(), **self._given())
         a = GradientOperator("forward", fields.steps)
         data = Quadratic.of(fields)
-        v, w, _ = data
+        v, w, *_ = data
         z = start = self._height(fields, v, w, None)
         valid, coded = continued(z, w, fields.steps, self.z_tol)
         scales = _scales(fields, recipe.patch_sizes)
@@ -334,7 +347,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         gradient, n = fields.gradient, fields.gradient.shape[0]
         sigma, weight = self.sigma, fields.weight
         if sigma is None:
-            level, _ = noise_if_told(gradient, fields.mask, weight, fields.steps)
+            level, _ = noise_if_told(gradient, fields.mask, weight, fields.steps, fields.boundary)
         else:
             level = torch.as_tensor(sigma, dtype=gradient.dtype, device=gradient.device)
             if level.ndim > 1:

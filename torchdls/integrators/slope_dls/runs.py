@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,12 +18,40 @@ from torchdls.integrators.slope_dls.coding import Coded, average
 from torchdls.integrators.slope_dls.known import Known
 from torchdls.integrators.slope_dls.waves import cautious, shrink_slow_waves
 from torchdls.operators import GradientOperator, edge_slopes
-from torchdls.operators.edges import extend_edges
+from torchdls.operators.edges import extend_edges, wrapped_edge_slopes
+from torchdls.operators.modes import Boundary
 from torchdls.selection import discrepancy_guard
 from torchdls.solvers import solve
+from torchdls.solvers.periodic import solve_periodic
 
 _PERIODS = (24.0, 32.0)  # pixels: the waves to shrink are longer, after one run and after a blend
 KAPPA = 25.0  # trust in the coded slopes, as a multiple of that in the measured ones
+
+
+class Grid(NamedTuple):
+    """A full grid with equal trust: its steps (dx, dy), and how it ends."""
+
+    steps: tuple[float, float]
+    boundary: Boundary = "neumann"
+
+    def slopes(self, gradient: Tensor) -> Tensor:
+        """On the edges."""
+        return edge_slopes(gradient)[0] if self.boundary == "neumann" else wrapped_edge_slopes(gradient)
+
+    def differences(self, z: Tensor) -> Tensor:
+        """A z, continued over the edges that are not there."""
+        found = GradientOperator("forward", self.steps, self.boundary)(z)
+        return extend_edges(found) if self.boundary == "neumann" else found
+
+    def solve(self, v: Tensor) -> Tensor:
+        """The height of slopes on the edges."""
+        if self.boundary == "neumann":
+            return solve(v, pixel_size=self.steps).height
+        return solve_periodic(v, pixel_size=self.steps)
+
+    def least_squares(self, gradient: Tensor) -> Tensor:
+        """The height of slopes at the pixels."""
+        return self.solve(self.slopes(gradient))
 
 
 @dataclass(frozen=True)
@@ -62,23 +90,21 @@ class Run:
         first, last = self.tau
         return first + (last - first) * iteration / max(1, self.n_iter - 1)
 
-    def heights(
-        self, gradient: Tensor, start: Tensor, noise: Tensor, steps: tuple[float, float], guard: bool
-    ) -> Iterator[Tensor]:
+    def heights(self, gradient: Tensor, start: Tensor, noise: Tensor, grid: Grid, guard: bool) -> Iterator[Tensor]:
         """The height (N, 1, H, W) after each iteration, on a full rectangle with equal trust.
 
         Args:
             gradient: (N, 2, H, W).
             start: (N, 1, H, W), the least-squares height.
             noise: (N,) standard deviation of one gradient sample.
-            steps: (dx, dy).
+            grid: of the heights.
             guard: give back what was removed beyond the noise (`discrepancy_guard`).
         """
-        v, a, z = edge_slopes(gradient)[0], GradientOperator("forward", steps), start
+        v, z = grid.slopes(gradient), start
         for iteration in range(self.n_iter):
-            coded = self.code(extend_edges(a(z)), noise, steps, iteration)
-            z = solve((v + KAPPA * coded) / (1 + KAPPA), pixel_size=steps).height
-            z = discrepancy_guard(z, start, noise, steps) if guard else z
+            coded = self.code(grid.differences(z), noise, grid.steps, iteration, boundary=grid.boundary)
+            z = grid.solve((v + KAPPA * coded) / (1 + KAPPA))
+            z = discrepancy_guard(z, start, noise, grid.steps, boundary=grid.boundary) if guard else z
             yield z
 
     def code(
@@ -88,6 +114,7 @@ class Run:
         steps: tuple[float, float],
         iteration: int,
         known: Known | None = None,
+        boundary: Boundary = "neumann",
     ) -> Tensor:
         """The mean of all estimates of all patches, (N, 2, H, W).
 
@@ -99,17 +126,37 @@ class Run:
             known: where the slopes are measured; the noise then is that far from every border, and a patch weighs as
                 much as it knows. Where no patch knows anything the slopes come back as they are. None: a full
                 rectangle with equal trust.
+            boundary: "neumann", or "periodic": patches reach around the torus.
         """
         tau, shape = self.threshold(iteration), (slopes.shape[-2], slopes.shape[-1])
         given, slopes = slopes, _turn(slopes) if self.turned else slopes
         parts = []
         for places in self.places(shape, iteration):
-            part = self._code(places, slopes, tau * noise[:, None, None, None], steps, known)
+            level = tau * noise[:, None, None, None]
+            if boundary == "periodic":
+                part = self._code_around(places, slopes, level, steps)
+            else:
+                part = self._code(places, slopes, level, steps, known)
             if self.turned:  # turning back mixes the two components, so they must share one weight
                 weight = part.weight.mean(1, keepdim=True)
                 part = Coded(_turn(part.total / part.weight) * weight, weight)
             parts.append(part)
         return average(parts) if known is None else average(parts, given)
+
+    def _code_around(self, places: Places, slopes: Tensor, level: Tensor, steps: tuple[float, float]) -> Coded:
+        """On a torus: laid out flat, so that patches find all their pixels, and folded back."""
+        flat, *positions = places.around()
+        rows, columns = (p.to(slopes.device) for p in positions)
+        noise = places.torus_noise(slopes, steps, self.turned)
+        coded = self._code_patches(
+            flat, slopes.index_select(-2, rows).index_select(-1, columns), level, lambda _: noise
+        )
+
+        def folded(x: Tensor) -> Tensor:
+            narrow = x.new_zeros(*x.shape[:-2], places.shape[0], x.shape[-1]).index_add(-2, rows, x)
+            return narrow.new_zeros(*x.shape[:-2], *places.shape).index_add(-1, columns, narrow)
+
+        return Coded(*map(folded, coded))
 
     def _code(
         self, places: Places, slopes: Tensor, level: Tensor, steps: tuple[float, float], known: Known | None
@@ -181,7 +228,7 @@ def smooth(
     runs: Sequence[Run],
     gradient: Tensor,
     noise: Tensor,
-    steps: tuple[float, float],
+    grid: Grid,
     guard: bool = True,
     watch: Callable[[Tensor], None] = lambda z: None,
 ) -> Tensor:
@@ -191,7 +238,7 @@ def smooth(
         runs: one or several.
         gradient: (N, 2, H, W), full rectangles with equal trust.
         noise: (N,) standard deviation of one gradient sample.
-        steps: (dx, dy).
+        grid: of the heights.
         guard: `discrepancy_guard` in every iteration, and `cautious` at the end.
         watch: called with the height after each iteration of the first run.
 
@@ -199,9 +246,9 @@ def smooth(
         (N, 1, H, W); differentiable, with the supports of the codes, the weights of the blend and the choices of the
         shrinkage held fixed.
     """
-    start, blend = blended(runs, gradient, noise, steps, guard, watch)
-    height = shrink_slow_waves(blend, start, noise, steps, slow_period(runs))
-    return cautious(height, start, blend, noise, steps) if guard else height
+    start, blend = blended(runs, gradient, noise, grid, guard, watch)
+    height = shrink_slow_waves(blend, start, noise, grid.steps, slow_period(runs), grid.boundary)
+    return cautious(height, start, blend, noise, grid.steps, boundary=grid.boundary) if guard else height
 
 
 def slow_period(runs: Sequence[Run]) -> float:
@@ -213,23 +260,23 @@ def blended(
     runs: Sequence[Run],
     gradient: Tensor,
     noise: Tensor,
-    steps: tuple[float, float],
+    grid: Grid,
     guard: bool = True,
     watch: Callable[[Tensor], None] = lambda z: None,
 ) -> tuple[Tensor, Tensor]:
     """The least-squares height, and that of `smooth` before its slow waves are looked at."""
-    start = _least_squares(gradient, steps)
+    start = grid.least_squares(gradient)
     heights = []
     for k, run in enumerate(runs):
         z = start
-        for following in run.heights(gradient, start, noise, steps, guard):
+        for following in run.heights(gradient, start, noise, grid, guard):
             z = following
             if k == 0:
                 watch(z)
         heights.append(z)
     if len(runs) == 1:
         return start, heights[0]
-    return start, _blend(runs, torch.stack(heights), start, gradient, noise, steps, guard)
+    return start, _blend(runs, torch.stack(heights), start, gradient, noise, grid, guard)
 
 
 def _blend(
@@ -238,7 +285,7 @@ def _blend(
     start: Tensor,
     gradient: Tensor,
     noise: Tensor,
-    steps: tuple[float, float],
+    grid: Grid,
     guard: bool,
 ) -> Tensor:
     """The runs' heights as `blend_by_waves` has them, from a second round of the runs on probed data."""
@@ -247,15 +294,11 @@ def _blend(
         step = 0.1 * level[:, None, None, None]
         step = torch.where(step > 0, step, 1)
         probed = gradient.detach() + step * n
-        again = _least_squares(probed, steps)
-        moved = [[again, *run.heights(probed, again, level, steps, guard)][-1] for run in runs]
+        again = grid.least_squares(probed)
+        moved = [[again, *run.heights(probed, again, level, grid, guard)][-1] for run in runs]
         changes = (torch.stack(moved) - heights.detach()) / step
-        pushed = _least_squares(n, steps)
-    return blend_by_waves(heights, changes, start, pushed, level, steps)
-
-
-def _least_squares(gradient: Tensor, steps: tuple[float, float]) -> Tensor:
-    return solve(edge_slopes(gradient)[0], pixel_size=steps).height
+        pushed = grid.least_squares(n)
+    return blend_by_waves(heights, changes, start, pushed, level, grid.steps, boundary=grid.boundary)
 
 
 def _turn(slopes: Tensor) -> Tensor:
