@@ -20,7 +20,9 @@ _TAPS: dict[str, tuple[float, ...]] = {
     "forward": (0.0, -1.0, 1.0),
     "backward": (-1.0, 1.0, 0.0),
     "central": (-0.5, 0.0, 0.5),
+    "pixel": (-0.5, 0.0, 0.5),
 }
+_FIRST = (-1.5, 2.0, -0.5)  # the slope at the first of three pixels; at the last one turned around
 
 
 @dataclass(frozen=True)
@@ -40,10 +42,17 @@ class GradientOperator:
     Two-tap stencils along one axis are evaluated as shifted differences, which are the same convolution (pinned equal
     by a test), faster by two orders of magnitude on a CPU; all others run as `conv2d` and `conv_transpose2d`.
 
+    "pixel" gives the slope *at* every pixel, which is what integrators read (the other stencils give slopes between
+    pixels, or none at the border): central differences, and at the border (-3 z_0 + 4 z_1 - z_2) / 2 and its mirror
+    image, all exact for quadratics (`numpy.gradient` with `edge_order=2`; two pixels share their difference, a single
+    one has slope 0). So `integrator(GradientOperator("pixel")(z))` is z but for its constant, exactly where z is a
+    quadratic and up to third derivatives elsewhere.
+
     With `boundary="periodic"` the height repeats: the pixel after the last is the first, and no slope is absent.
 
     Args:
-        stencil: "forward", "backward", "central", or a pair (k_x, k_y) of two-dimensional kernels with odd sides.
+        stencil: "forward", "backward", "central", "pixel", or a pair (k_x, k_y) of two-dimensional kernels with odd
+            sides.
         pixel_size: (dx, dy), the spacing of the columns and of the rows, or one number for both.
         boundary: "neumann" (slopes beyond the border are absent) or "periodic".
 
@@ -57,6 +66,8 @@ class GradientOperator:
         tensor([[1., 1., 1., 0.],
                 [1., 1., 1., 0.],
                 [1., 1., 1., 0.]])
+        >>> torchdls.LeastSquares()(torchdls.GradientOperator("pixel")(ramp.square()))[0, 0, 0].diff().round(decimals=3)
+        tensor([1., 3., 5.])
     """
 
     stencil: str | tuple[Kernel, Kernel] = "forward"
@@ -79,7 +90,7 @@ class GradientOperator:
 
     @property
     def kernels(self) -> tuple[Kernel, Kernel]:
-        """The pair (k_x, k_y), without the division by the pixel size."""
+        """The pair (k_x, k_y), without the division by the pixel size; of "pixel" those away from the border."""
         if isinstance(self.stencil, str):
             taps = _TAPS[self.stencil]
             return (taps,), tuple((t,) for t in taps)
@@ -90,16 +101,25 @@ class GradientOperator:
         """Upper bound of the spectral norm ||A||: sqrt((|k_x|_1 / dx)^2 + (|k_y|_1 / dy)^2).
 
         A kernel's frequency response is at most the sum of its absolute taps. Forward differences: sqrt(8), central:
-        sqrt(2).
+        sqrt(2), pixel: sqrt(32), from its borders.
         """
+        if self._one_sided:
+            return hypot(*(4 / d for d in self.pixel_size))
         return hypot(
             *(sum(abs(t) for row in k for t in row) / d for k, d in zip(self.kernels, self.pixel_size, strict=True))
         )
+
+    @property
+    def _one_sided(self) -> bool:
+        """Whether the slopes of the border pixels come from within."""
+        return self.stencil == "pixel" and self.boundary != "periodic"
 
     @full_precision
     def __call__(self, z: Tensor) -> Tensor:
         """Slopes (N, 2, H, W) of a height (N, 1, H, W); TypeError or ValueError if it is not one."""
         check_field("GradientOperator", "z", z, 1)
+        if self._one_sided:
+            return torch.cat([_at_pixels(z, dim, d) for dim, d in zip((-1, -2), self.pixel_size, strict=True)], -3)
         if self.boundary == "periodic":
             return torch.cat([_roll(z, k, d, -1) for k, d in zip(self.kernels, self.pixel_size, strict=True)], -3)
         return torch.cat([_correlate(z, k, d) for k, d in zip(self.kernels, self.pixel_size, strict=True)], -3)
@@ -110,6 +130,8 @@ class GradientOperator:
         check_field("GradientOperator", "g", g, 2)
         gx, gy = g.split(1, -3)
         (kx, ky), (dx, dy) = self.kernels, self.pixel_size
+        if self._one_sided:
+            return _at_pixels_transpose(gx, -1, dx) + _at_pixels_transpose(gy, -2, dy)
         if self.boundary == "periodic":
             return _roll(gx, kx, dx, 1) + _roll(gy, ky, dy, 1)
         return _correlate_transpose(gx, kx, dx) + _correlate_transpose(gy, ky, dy)
@@ -211,6 +233,30 @@ def _correlate_transpose(g: Tensor, kernel: Kernel, spacing: float) -> Tensor:
         image = F.conv_transpose2d(g, _weight(taps, spacing, g))
     rows, columns = _window(taps, top, left, h, w)
     return F.pad(image, (columns.start, w - columns.stop, rows.start, h - rows.stop))
+
+
+def _at_pixels(z: Tensor, dim: int, spacing: float) -> Tensor:
+    n = z.shape[dim]
+    if n < 3:
+        return (z.narrow(dim, 1, 1) - z.narrow(dim, 0, 1)).expand_as(z) / spacing if n == 2 else torch.zeros_like(z)
+    inner = (z.narrow(dim, 2, n - 2) - z.narrow(dim, 0, n - 2)) * 0.5
+    a, b, c = _FIRST
+    first = z.narrow(dim, 0, 1) * a + z.narrow(dim, 1, 1) * b + z.narrow(dim, 2, 1) * c
+    last = z.narrow(dim, n - 1, 1) * -a - z.narrow(dim, n - 2, 1) * b - z.narrow(dim, n - 3, 1) * c
+    return torch.cat([first, inner, last], dim) / spacing
+
+
+def _at_pixels_transpose(g: Tensor, dim: int, spacing: float) -> Tensor:
+    n, z = g.shape[dim], torch.zeros_like(g)
+    if n < 3:
+        return torch.cat([-g.sum(dim, keepdim=True), g.sum(dim, keepdim=True)], dim) / spacing if n == 2 else z
+    inner, first, last = (g.narrow(dim, *part) for part in ((1, n - 2), (0, 1), (n - 1, 1)))
+    z.narrow(dim, 2, n - 2).add_(inner, alpha=0.5)
+    z.narrow(dim, 0, n - 2).sub_(inner, alpha=0.5)
+    for i, tap in enumerate(_FIRST):
+        z.narrow(dim, i, 1).add_(first, alpha=tap)
+        z.narrow(dim, n - 1 - i, 1).sub_(last, alpha=tap)
+    return z / spacing
 
 
 def _roll(z: Tensor, kernel: Kernel, spacing: float, direction: int) -> Tensor:
