@@ -27,6 +27,7 @@ MAY_IMPORT |= {
     "photometric": {"operators", "solvers", "dictionary", "geometry"},
     "io": {"geometry"},
     "plot": {"operators", "geometry", "metrics"},
+    "sequences": {"operators", "solvers", "dictionary", "noise"},
     "persistence": {"integrators"},
     "reconstruction": {"operators", "geometry", "integrators"},
     "large": {"operators", "noise", "integrators", "geometry"},

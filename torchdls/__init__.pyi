@@ -118,6 +118,10 @@ from .reconstruction import Reconstruction as Reconstruction
 from .reconstruction import reconstruct as reconstruct
 from .selection import Selection as Selection
 from .selection import select as select
+from .sequences import OnlineDLS as OnlineDLS
+from .sequences import SequenceDLS as SequenceDLS
+from .sequences import SequencePatches as SequencePatches
+from .sequences import SequenceResult as SequenceResult
 from .solvers import ConvergenceWarning as ConvergenceWarning
 from .solvers import SolveResult as SolveResult
 from .solvers import solve as solve
