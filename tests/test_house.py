@@ -30,7 +30,7 @@ MAY_IMPORT |= {
     "sequences": {"operators", "solvers", "dictionary", "noise"},
     "persistence": {"integrators"},
     "reconstruction": {"operators", "geometry", "integrators"},
-    "large": {"operators", "noise", "integrators", "geometry"},
+    "large": {"operators", "solvers", "noise", "integrators", "geometry"},
     "batch": {"operators", "solvers", "integrators", "geometry", "io"},
     "_registry": {"dictionary", "integrators"},  # for their types alone: it is read before PyTorch is loaded
 }

@@ -5,9 +5,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import label
 
 from torchdls import (
     DLS,
+    ConvergenceWarning,
     GradientOperator,
     LeastSquares,
     SlopeDLS,
@@ -24,7 +26,10 @@ from torchdls import (
 )
 from torchdls.integrators.slope_dls.runs import Grid, blended
 from torchdls.integrators.slope_dls.waves import cautious
+from torchdls.large.files import Field
+from torchdls.large.masked import Parts
 from torchdls.large.slope_dls import spans
+from torchdls.large.transform import Passes
 from torchdls.surfaces import SURFACES
 
 
@@ -172,7 +177,16 @@ def test_from_the_command_line(tmp_path, capsys):
     large.integrate(expected, tiled, integrator=SlopeDLS(recipe="quick"), tile=64)
     np.testing.assert_array_equal(io.load_height(tmp_path / "z.tiff").height[0, 0].numpy(), tiled)
     assert main([*arguments, "--method", "least_squares", "--force", "--mask", "m.png"]) == 2
-    assert "--mask" in capsys.readouterr().err
+    assert "m.png: unknown format" in capsys.readouterr().err
+    mask = disk_ring_and_specks(100, 90)
+    np.save(tmp_path / "m.npy", mask)
+    masked = [*arguments, "--method", "least_squares", "--force", "--mask", str(tmp_path / "m.npy")]
+    assert main(masked) == 0
+    found = io.load_height(tmp_path / "z.tiff").height[0, 0].numpy()
+    exact = LeastSquares(tol=1e-9)(torch.from_numpy(expected).double(), torch.from_numpy(mask)[None])[0].numpy()
+    assert np.abs(found - exact).max() < 1e-4 * np.ptp(exact)
+    assert main([*masked, "--camera", "1,1,0,0"]) == 2
+    assert "--camera" in capsys.readouterr().err
 
 
 def smoothed(g, recipe, **options):
@@ -257,3 +271,74 @@ def test_windows_cover_the_surface_and_their_weights_add_up(n, tile, halo):
 def test_what_is_not_done_in_tiles(integrator, error, match):
     with pytest.raises(error, match=match):
         large.integrate(np.zeros((2, 8, 8)), np.zeros((8, 8)), integrator=integrator)
+
+
+def disk_ring_and_specks(h, w):
+    y, x = np.mgrid[:h, :w]
+    radius = np.hypot(y - h / 2, x - w / 2)
+    mask = (radius < 0.3 * min(h, w)) | ((radius > 0.36 * min(h, w)) & (radius < 0.48 * min(h, w)))
+    mask |= np.random.default_rng(0).random((h, w)) < 0.02
+    return mask & (x != w // 2 + 3)
+
+
+@pytest.mark.parametrize("tile, step", [(7, (1.0, 1.0)), (33, (2.0, 0.5)), (200, (1.0, 1.0))])
+def test_masked_least_squares_equals_that_in_memory(tile, step):
+    g, mask, found = field(80, 66), disk_ring_and_specks(80, 66), np.empty((80, 66))
+    holed = np.where(mask, g, np.nan)
+    exact = LeastSquares(tol=1e-12, pixel_size=step)
+    result = large.integrate(holed, found, mask=mask, integrator=exact, tile=tile)
+    expected = exact(torch.from_numpy(holed), torch.from_numpy(mask)[None])[0].numpy()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    assert result.converged
+    assert 5 < result.iterations < 100
+
+
+def test_masked_in_single_precision_and_from_files(tmp_path):
+    g, mask = field(90, 70, np.float32), disk_ring_and_specks(90, 70)
+    np.save(tmp_path / "g.npy", g)
+    np.save(tmp_path / "m.npy", mask.astype(np.uint8) * 255)
+    large.integrate(tmp_path / "g.npy", tmp_path / "z.npy", mask=tmp_path / "m.npy", tile=20)
+    expected = LeastSquares(tol=1e-10)(torch.from_numpy(g).double(), torch.from_numpy(mask)[None])[0].numpy()
+    assert np.abs(np.load(tmp_path / "z.npy") - expected).max() < 1e-4 * np.ptp(expected)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["g.npy", "m.npy", "z.npy"]
+
+
+def test_masked_normals_read_nothing_outside():
+    g, mask = field(40, 50), disk_ring_and_specks(40, 50)
+    normals = np.where(mask, gradient_to_normals(torch.from_numpy(g)).numpy(), np.nan)
+    found, again = np.empty((40, 50)), np.empty((40, 50))
+    large.integrate(normals, found, mask=mask, tile=16)
+    large.integrate(g, again, mask=mask, tile=16)
+    np.testing.assert_allclose(found, again, rtol=0, atol=1e-9)
+    assert not found[~mask].any()
+
+
+@pytest.mark.parametrize("tile", [1, 3, 50])
+def test_components_over_bands(tile, tmp_path):
+    mask = np.random.default_rng(1).random((23, 31)) < 0.6
+    passes = Passes(Field(np.zeros((2, 23, 31)), None, mask), (1.0, 1.0), tile, tmp_path, lambda text: None)
+    parts = Parts(passes)
+    labels, count = label(mask)
+    found = np.concatenate([parts.of(rows) for rows in passes.bands()])
+    assert len(parts.size) == count + 1
+    assert (found[~mask] == count).all()
+    pairs = np.unique(np.stack([labels[mask], found[mask]]), axis=1)
+    assert pairs.shape[1] == count  # one number each
+    for own, theirs in pairs.T:
+        assert parts.size[theirs] == (labels == own).sum()
+
+
+def test_what_a_mask_may_not_be():
+    g, z = np.zeros((2, 8, 8)), np.zeros((8, 8))
+    with pytest.raises(ValueError, match=r"mask \(8, 9\)"):
+        large.integrate(g, z, mask=np.ones((8, 9)))
+    with pytest.raises(ValueError, match="False everywhere"):
+        large.integrate(g, z, mask=np.zeros((8, 8)))
+    with pytest.raises(ValueError, match="least squares alone"):
+        large.integrate(g, z, mask=np.ones((8, 8)), integrator=SlopeDLS())
+    with pytest.raises(ValueError, match="not finite in rows 0 to"):
+        large.integrate(g * np.nan, z, mask=np.ones((8, 8)))
+    large.integrate(g, z, mask=np.ones((8, 8)))
+    assert not z.any()
+    with pytest.warns(ConvergenceWarning, match="after 1 iterations"):
+        large.integrate(field(30, 30), np.empty((30, 30)), mask=np.tri(30), integrator=LeastSquares(max_iter=1))

@@ -39,8 +39,8 @@ def add_integrate(commands: Any) -> None:
     add("--set", action="append", default=[], metavar="NAME=VALUE", help="option of the method, such as lam=0.5")
     add("--mask", metavar="FILE", help="image or array; white or nonzero is valid")
     add_manner(command)
-    add("--tile", type=int, metavar="N", help="least_squares or slope_dls of a full NPY, Zarr or TIFF of floats, "
-        "larger than memory if need be, by N rows or columns (slope_dls: tiles), to NPY, Zarr or BigTIFF")  # fmt: skip
+    add("--tile", type=int, metavar="N", help="least_squares (also with --mask) or slope_dls of an NPY, Zarr or TIFF of "
+        "floats, larger than memory if need be, by N rows (slope_dls: tiles), to NPY, Zarr or BigTIFF")  # fmt: skip
     add("--unit", metavar="NAME", help="unit of the heights, for the labels of pictures, such as mm")
     add("--force", action="store_true", help="replace output files that exist")
     add("--quiet", action="store_true", help="no progress bar and no report")
@@ -128,15 +128,16 @@ def _integrate_large(arguments: argparse.Namespace) -> None:
 
     if arguments.method not in ("least_squares", "slope_dls"):
         raise ValueError("--tile: least_squares and slope_dls alone are done in tiles")
-    for name in ("mask", "camera", "channels"):
+    for name in ("camera", "channels"):
         if getattr(arguments, name) is not None:
-            raise ValueError(f"--tile: full rectangles alone are done in tiles, --{name} is given")
+            raise ValueError(f"--tile: gradients and normals of floats alone are done in tiles, --{name} is given")
     if arguments.float64 or len(arguments.out) > 1:
         raise ValueError("--tile: in the precision of the input and to one output; --float64 or several -o are given")
     start, size = time.perf_counter(), _pixel_size(arguments.pixel_size) or (1.0, 1.0)
     result = large.integrate(
         arguments.input,
         arguments.out[0],
+        mask=arguments.mask,
         integrator=build_method(arguments.method, size, arguments.set),
         convention=arguments.convention,
         tile=arguments.tile,

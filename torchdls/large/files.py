@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from torchdls._files import Array, as_tensor, atomic_file, check_output, require
@@ -25,14 +26,16 @@ class Field:
     Args:
         array: anything with `shape` and `dtype` that gives arrays for slices.
         convention: of the gradient or the normals; None for the default.
+        mask: likewise, (H, W), not 0 where the slopes are valid; None for a full rectangle.
     """
 
     array: Any
     convention: str | None = None
+    mask: Any = None
 
     @classmethod
-    def open(cls, source: Any, convention: str | None) -> Field:
-        """The field in a file, or of an array.
+    def open(cls, source: Any, convention: str | None, mask: Any = None) -> Field:
+        """The field in a file, or of an array; and its mask.
 
         Raises:
             TypeError: the entries are no floats.
@@ -44,7 +47,10 @@ class Field:
             raise ValueError(f"large.integrate: source {shape} given, (2, H, W) or (3, H, W) is needed")
         if dtype.kind != "f":
             raise TypeError(f"large.integrate: source has dtype {dtype}; floats are needed")
-        return cls(array, convention)
+        mask = None if mask is None else _opened(mask)
+        if mask is not None and tuple(mask.shape) != shape[1:]:
+            raise ValueError(f"large.integrate: mask {tuple(mask.shape)} given for a source {shape}")
+        return cls(array, convention, mask)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -60,14 +66,21 @@ class Field:
         """(2, h, w) of a part in the library's convention."""
         values = as_tensor(np.array(self.array[:, rows, columns], order="C"))
         where = f"rows {rows.start} to {rows.stop - 1}"
+        inside = None if self.mask is None else self.inside(rows, columns)
+        if inside is not None:
+            values = torch.where(inside, values, 0)
         if not bool(values.isfinite().all()):
-            raise ValueError(f"large.integrate: not finite in {where}; a full rectangle is needed")
+            raise ValueError(f"large.integrate: not finite in {where}, in the mask or without one")
         if len(values) == 2:
             return convert_gradient(values, self.convention or "image")
-        found = normals_to_gradient(values, self.convention or "opengl")
+        found = normals_to_gradient(values, self.convention or "opengl", mask=inside)
         if int(found.invalid):
             raise ValueError(f"large.integrate: {int(found.invalid)} normals face away, or are none, in {where}")
         return found.gradient
+
+    def inside(self, rows: slice, columns: slice = slice(None)) -> Tensor:
+        """(1, h, w) bool of a part of the mask."""
+        return torch.from_numpy(np.array(self.mask[rows, columns]) != 0)[None]
 
 
 def parts(n: int, size: int) -> Iterator[slice]:

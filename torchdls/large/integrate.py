@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,9 +16,11 @@ import torch
 from torchdls.integrators import Integrator, LeastSquares, SlopeDLS
 from torchdls.large.files import Field, checked_output, parts, write
 from torchdls.large.least_squares import least_squares
+from torchdls.large.masked import Masked
 from torchdls.large.slope_dls import HALO, noise_of, slope_dls, spans
 from torchdls.large.transform import Passes, rows_at_once
 from torchdls.operators import as_pixel_size
+from torchdls.solvers import ConvergenceWarning
 
 # Bytes that a pixel of a window takes while it is smoothed, for float32 (measured: 1,100).
 _WINDOW = 1200
@@ -32,6 +35,8 @@ class LargeResult(NamedTuple):
         passes: the bands, strips and bands of the (last) solve.
         tiles: rows and columns of tiles; (0, 0) for least squares, which needs none.
         noise: standard deviation of one gradient sample, as SlopeDLS took it; None for least squares.
+        iterations: of conjugate gradients with a mask, else 0.
+        converged: whether they met the tolerance within the limit of the integrator.
     """
 
     shape: tuple[int, int]
@@ -39,12 +44,15 @@ class LargeResult(NamedTuple):
     passes: tuple[int, int, int]
     tiles: tuple[int, int] = (0, 0)
     noise: float | None = None
+    iterations: int = 0
+    converged: bool = True
 
 
 def integrate(
     source: str | os.PathLike[str] | Any,
     out: str | os.PathLike[str] | Any,
     *,
+    mask: str | os.PathLike[str] | Any = None,
     integrator: Integrator | None = None,
     convention: str | None = None,
     pixel_size: float | Sequence[float] | None = None,
@@ -55,7 +63,7 @@ def integrate(
     overwrite: bool = False,
     progress: Callable[[str], None] = lambda text: None,
 ) -> LargeResult:
-    r"""The height of a full rectangle that need not fit into memory, by `LeastSquares` or `SlopeDLS`.
+    r"""The height of a field that need not fit into memory, by `LeastSquares` or `SlopeDLS`.
 
     Least squares is exact: equal to that of the whole to rounding, in three passes over a file. SlopeDLS smooths tiles
     with a halo, with the noise level of the whole, and blends the slopes of what it changed,
@@ -65,14 +73,19 @@ def integrate(
     by one exact solve; slow waves, and how far least squares is left, are then judged by the whole. One tile is
     SlopeDLS itself; more differ by some percent of its error (docs/scale.md).
 
-    Besides the files it takes `scratch` space of one height (SlopeDLS: two), and `memory` for its own arrays; time
-    grows as H W log(H W). Masks, weights and anchors are not taken: their solve is iterative.
+    With a mask, least squares goes by conjugate gradients whose vectors are files, preconditioned by that of the full
+    rectangle; they stop at the integrator's `tol`.
+
+    Besides the files it takes `scratch` space of one height (SlopeDLS: two; with a mask: four, and eight bytes for each
+    pixel), and `memory` for its own arrays; time grows as H W log(H W). Weights and anchors are not taken.
 
     Args:
         source: gradient (2, H, W) or normals (3, H, W) of floats: an NPY file, a Zarr array, an uncompressed TIFF, or
             anything with `shape` that gives arrays for slices.
         out: NPY, Zarr or a tiled BigTIFF, written whole or not at all (Zarr: a new array), or anything of shape (H, W)
             that takes arrays for slices of rows.
+        mask: (H, W) in a file or an array, not 0 where the slopes are valid; the rest is never read. With least squares
+            alone. None for a full rectangle.
         integrator: `LeastSquares()`, which None stands for, or `SlopeDLS(...)` with the recipe "blend" or "quick",
             without `robust`, with one noise level or None, and with the guard "discrepancy" or None.
         convention: of the gradient (default: image) or of the normals (default: opengl).
@@ -105,10 +118,14 @@ def integrate(
         True
     """
     method = LeastSquares() if integrator is None else integrator
-    _check(method, tile, halo)
-    field = Field.open(source, convention)
+    _check(method, tile, halo, mask is not None)
+    field = Field.open(source, convention, mask)
     size, smooths = field.shape, isinstance(method, SlopeDLS)
-    held = rows_at_once(memory, size, field.dtype, 1 + smooths) if tile is None or smooths else tile
+    held = (
+        rows_at_once(memory, size, field.dtype, 2 if smooths or mask is not None else 1)
+        if tile is None or smooths
+        else tile
+    )
     step = method.pixel_size if pixel_size is None else as_pixel_size(pixel_size)
     beside = checked_output(out, size, overwrite)
     tile = (_tile(memory, halo, field.dtype) if smooths else held) if tile is None else tile
@@ -121,9 +138,21 @@ def integrate(
             level = noise_of(passes, method, windows)
             heights = slope_dls(passes, method, windows, level)
             result = result._replace(tiles=(len(windows[0]), len(windows[1])), noise=float(level))
+        elif isinstance(method, LeastSquares) and mask is not None:
+            system = Masked(passes)
+            converged = system.solve(method.tol, method.max_iter)
+            result = result._replace(iterations=system.iterations, converged=converged)
+            heights = system.heights()
         else:
             heights = least_squares(passes)
         write(out, heights, size, field.dtype, overwrite)
+    if not result.converged:
+        warnings.warn(
+            f"large.integrate: stopped after {result.iterations} iterations at a relative residual of "
+            f"{system.residual:.1e}, where tol={method.tol:.1e} is asked for",
+            ConvergenceWarning,
+            stacklevel=2,
+        )
     return result
 
 
@@ -135,12 +164,14 @@ def _tile(memory: int, halo: int, dtype: Any) -> int:
     return side // 128 * 128 or side
 
 
-def _check(method: Integrator, tile: int | None, halo: int) -> None:
+def _check(method: Integrator, tile: int | None, halo: int, masked: bool) -> None:
     if type(method) is LeastSquares:
         usable = method.boundary == "neumann"
     elif type(method) is SlopeDLS:
         single = method.sigma is None or torch.as_tensor(method.sigma).numel() == 1
         usable = method.recipe != "plain" and not method.robust and method.guard != "sure" and single
+        if masked:
+            raise ValueError("large.integrate: mask is given, which least squares alone takes")
     else:
         raise TypeError(f"large.integrate: integrator={method!r} given, LeastSquares or SlopeDLS is needed")
     if not usable:

@@ -107,9 +107,10 @@ class Passes:
         self.say(f"{len(found)} {what}")
         return found
 
-    def scratch(self, name: str) -> Array:
-        """An array of zeros (H, W) in a file of its own."""
-        found: Array = np.lib.format.open_memmap(self.place / f"{name}.npy", "w+", self.field.dtype, self.size)
+    def scratch(self, name: str, dtype: Any = None) -> Array:
+        """An array of zeros (H, W) in a file of its own, of the dtype of the field if none is given."""
+        dtype = self.field.dtype if dtype is None else dtype
+        found: Array = np.lib.format.open_memmap(self.place / f"{name}.npy", "w+", dtype, self.size)
         return found
 
     def divergence(self, rows: slice, step: tuple[float, float]) -> Tensor:
