@@ -4,7 +4,8 @@ import pytest
 import torch
 from scipy.fft import dstn
 
-from torchdls.noise import _CUT, _TRIMMED_VARIANCE, add_noise, averaging_error, noise_level, noise_sigma
+from torchdls.noise import add_noise, averaging_error, noise_level, noise_sigma
+from torchdls.noise.level import _CUT, _TRIMMED_VARIANCE
 from torchdls.operators import GradientOperator, dct2, edge_slopes, idct2, neumann_eigenvalues
 from torchdls.surfaces import SURFACES, terrain
 

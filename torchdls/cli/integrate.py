@@ -39,8 +39,8 @@ def add_integrate(commands: Any) -> None:
     add("--set", action="append", default=[], metavar="NAME=VALUE", help="option of the method, such as lam=0.5")
     add("--mask", metavar="FILE", help="image or array; white or nonzero is valid")
     add_manner(command)
-    add("--tile", type=int, metavar="N", help="least_squares (also with --mask) or slope_dls of an NPY, Zarr or TIFF of "
-        "floats, larger than memory if need be, by N rows (slope_dls: tiles), to NPY, Zarr or BigTIFF")  # fmt: skip
+    add("--tile", type=int, metavar="N", help="least_squares (also with --mask) or slope_dls of an NPY, Zarr or TIFF "
+        "of floats, larger than memory if need be, by N rows (slope_dls: tiles), to NPY, Zarr or BigTIFF")  # fmt: skip
     add("--unit", metavar="NAME", help="unit of the heights, for the labels of pictures, such as mm")
     add("--force", action="store_true", help="replace output files that exist")
     add("--quiet", action="store_true", help="no progress bar and no report")
