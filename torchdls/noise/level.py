@@ -28,10 +28,6 @@ _CUT = 3.0  # samples beyond so many standard deviations belong to the surface (
 _KEPT = math.erf(_CUT / math.sqrt(2))
 _TRIMMED_VARIANCE = 1 - _CUT * math.sqrt(2 / math.pi) * math.exp(-_CUT * _CUT / 2) / _KEPT  # of a cut standard normal
 
-_CUT = 3.0  # samples beyond so many standard deviations belong to the surface (creases, waves), not to the noise
-_KEPT = math.erf(_CUT / math.sqrt(2))
-_TRIMMED_VARIANCE = 1 - _CUT * math.sqrt(2 / math.pi) * math.exp(-_CUT * _CUT / 2) / _KEPT  # of a cut standard normal
-
 
 @full_precision
 def noise_level(
