@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from torchdls.dictionary.polar import polar_factor
 from torchdls.dictionary.unitary import Unitary
 
 
@@ -61,3 +62,32 @@ def test_needs_a_square_dictionary():
     P = torch.ones(1, 4, 5)
     with pytest.raises(ValueError, match=r"Unitary: dictionary \(1, 4, 6\)"):
         Unitary()(P, torch.ones(1, 4, 6), torch.zeros(1, 6, 5), 0.1)
+
+
+def with_singular_values(generator, *values):
+    n = len(values)
+    u, v = (torch.linalg.qr(torch.randn(2, n, n, generator=generator, dtype=torch.float64)).Q for _ in range(2))
+    return (u * torch.tensor(values, dtype=torch.float64)) @ v.mT
+
+
+# Of the SVD alone the derivative is NaN at the first three.
+@pytest.mark.parametrize("values", [(2, 2, 2), (3, 3, 1), (2, 1, 1), (3, 2, 1)], ids=str)
+def test_derivatives_at_equal_singular_values(generator, values):
+    M = with_singular_values(generator, *values).requires_grad_()
+    assert torch.autograd.gradcheck(polar_factor, M, check_forward_ad=True, check_batched_grad=True)
+    assert torch.autograd.gradgradcheck(polar_factor, M, check_fwd_over_rev=True)
+    torch.testing.assert_close(polar_factor(M) @ polar_factor(M).mT, torch.eye(3).double().expand(2, -1, -1))
+
+
+def test_what_singular_values_of_0_leave_open_does_not_move(generator):
+    M = with_singular_values(generator, 2, 1, 0, 0).requires_grad_()
+    (slope,) = torch.autograd.grad(polar_factor(M)[:, 0].sum(), M)
+    assert bool(slope.isfinite().all())
+    assert float(slope.abs().max()) < 10
+
+
+def test_the_learner_has_a_derivative_where_the_codes_are_alike():
+    """Patches that are each an atom: P B^T is a multiple of the identity."""
+    P = torch.eye(4, dtype=torch.float64)[None].repeat(1, 1, 3).requires_grad_()
+    D, B = torch.eye(4, dtype=torch.float64)[None], torch.zeros(1, 4, 12, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda P: Unitary()(P, D, B, 0.5)[1], P)

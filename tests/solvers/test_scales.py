@@ -67,6 +67,19 @@ def test_anchors_of_very_different_weights_at_once(dtype):
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("firm", [1e3, 1e8, 1e12])
+def test_firm_anchors_where_every_pixel_is_held(firm, dtype):
+    """As in the height step of DLS: what firm anchors weigh must not swallow the tolerance of the rest."""
+    z, g = relief(32)
+    r = torch.full_like(z, 0.5)
+    r[..., 0] = firm
+    anchor = z + random_field(1, 1, 32, 32, seed=3)
+    height = solve(edge_slopes(g)[0].to(dtype), None, anchor.to(dtype), r.to(dtype)).height
+    expected = torch.from_numpy(sparse_solve(edge_slopes(g)[0][0], None, anchor[0], r[0]))[None, None]
+    assert error(height, expected) < 1e-5
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
 def test_metres(dtype):
     """Pixels of .01 mm, a surface .25 m away."""
     z, g = relief()

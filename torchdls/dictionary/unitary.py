@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchdls._precision import full_precision
 from torchdls.dictionary.learners import Step, check_options
+from torchdls.dictionary.polar import polar_factor
 from torchdls.dictionary.thresholds import Threshold, shrink
 
 
@@ -20,7 +21,8 @@ class Unitary:
         B = shrink(D^T P, mu)        D = U V^T, where P B^T = U S V^T
 
     Each step is the exact minimum over its variable, so a pass never raises the cost. The dictionary must be square,
-    and the codes leave no patch of it out: K = n. Differentiable where the singular values of P B^T differ.
+    and the codes leave no patch of it out: K = n. Differentiable where no singular value of P B^T is 0, equal ones
+    included; what those that are 0 leave open is taken not to move.
 
     Args:
         threshold: "hard", "soft" or "firm".
@@ -64,8 +66,4 @@ class Unitary:
 def _nearest(moment: Tensor, D: Tensor) -> Tensor:
     """argmax over orthonormal X of <X, moment>; D itself where the moment is 0, which leaves X free."""
     some = (moment != 0).flatten(1).any(1)[:, None, None]
-    n = D.shape[-1]
-    # What stands in for 0 has singular values that differ: their derivative is finite, and goes nowhere.
-    ladder = D * torch.arange(1, n + 1, dtype=D.dtype, device=D.device)
-    u, _, v = torch.linalg.svd(torch.where(some, moment, ladder))
-    return torch.where(some, u @ v, D)
+    return torch.where(some, polar_factor(torch.where(some, moment, D)), D)

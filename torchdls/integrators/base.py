@@ -18,7 +18,15 @@ from torchdls._precision import full_precision
 from torchdls._tracing import all_finite
 from torchdls.integrators.data_term import DataTerm
 from torchdls.integrators.fields import Fields as Fields
-from torchdls.integrators.fields import check_accepted, check_values, edge_fields, fit_fields, on_torus, within_mask
+from torchdls.integrators.fields import (
+    check_accepted,
+    check_values,
+    edge_fields,
+    fit_fields,
+    level_anchors,
+    on_torus,
+    within_mask,
+)
 from torchdls.operators import as_pixel_size
 
 Callback = Callable[[int, Tensor], None]
@@ -73,6 +81,9 @@ class Integrator(nn.Module, ABC):
     # Whether the method sees the slopes only on the edges of the grid, so that they can be given there (`from_edges`).
     _reads_edges: bool = False
 
+    # Whether a constant on all anchors of a component is a constant on its heights, and nothing more.
+    _follows_offsets: bool = True
+
     def __init__(self, *, pixel_size: float | Sequence[float] = 1.0) -> None:
         super().__init__()
         self.pixel_size = as_pixel_size(pixel_size)
@@ -106,9 +117,9 @@ class Integrator(nn.Module, ABC):
                 (see `accepts`), or the height is beyond what its dtype can hold. The message names the argument and
                 the shapes.
         """
-        fields = self._check_fields(gradient, mask, weight, anchor, anchor_weight)
+        fields, level = self._levelled_fields(gradient, mask, weight, anchor, anchor_weight)
         height = self._integrate(fields)
-        height = self._finite(height if self._unit == 1 else height * self._unit)
+        height = self._placed(height if self._unit == 1 else height * self._unit, level)
         return height if gradient.ndim == 4 else height[0]
 
     @full_precision
@@ -148,8 +159,8 @@ class Integrator(nn.Module, ABC):
             >>> torchdls.LeastSquares().from_edges(v, w).round(decimals=3)
             tensor([[[[-0.5000,  0.5000, -0.5000,  0.5000]]]])
         """
-        height = self._integrate(self._check_edges(slopes, trust, mask, anchor, anchor_weight))
-        height = self._finite(height if self._unit == 1 else height * self._unit)
+        fields, level = level_anchors(self._check_edges(slopes, trust, mask, anchor, anchor_weight))
+        height = self._placed(self._integrate(self._in_pixels(fields)) * self._unit, level)
         return height if slopes.ndim == 4 else height[0]
 
     if TYPE_CHECKING:  # the call of `nn.Module` gives Any
@@ -222,9 +233,9 @@ class Integrator(nn.Module, ABC):
             TypeError: as `forward`.
             ValueError: as `forward`.
         """
-        fields = self._check_fields(gradient, mask, weight, anchor, anchor_weight)
+        fields, level = self._levelled_fields(gradient, mask, weight, anchor, anchor_weight)
         result = self._report(fields)
-        return result._replace(height=self._finite(result.height * self._unit))
+        return result._replace(height=self._placed(result.height * self._unit, level))
 
     def _report(self, fields: Fields) -> IntegrationResult:
         """The height in pixels from checked fields, and how it went; a method that iterates says so."""
@@ -235,6 +246,10 @@ class Integrator(nn.Module, ABC):
     def _data_term(self, fields: Fields) -> DataTerm:
         """The data term of checked fields; what methods built on the solve (*) provide."""
         raise TypeError(f"{type(self).__name__} has no data term: it is not built on the solve")
+
+    def _placed(self, height: Tensor, level: Tensor | None) -> Tensor:
+        """The height in the unit of `pixel_size` with its level, if the numbers of its dtype reach so far."""
+        return self._finite(height if level is None else height + level)
 
     def _finite(self, height: Tensor) -> Tensor:
         """The height, if the numbers of its dtype reach so far."""
@@ -257,7 +272,7 @@ class Integrator(nn.Module, ABC):
         anchor: Tensor | None,
         anchor_weight: Tensor | float | None,
     ) -> Fields:
-        """Validate the arguments of `from_edges` and bring them to the form of `Fields`."""
+        """The arguments of `from_edges` as one batch, found to fit, in the unit of `pixel_size`."""
         name = type(self).__name__
         if not self._reads_edges:
             raise ValueError(f"{name}: takes no slopes on edges; LeastSquares, L1, Huber, MEstimator and DLS do")
@@ -265,7 +280,7 @@ class Integrator(nn.Module, ABC):
         check_field(name, "slopes", slopes, 2)
         checked = within_mask(name, fit_fields(name, torch.zeros_like(slopes), mask, None, anchor, anchor_weight))
         check_values(name, checked)
-        return self._in_pixels(edge_fields(name, slopes, trust, checked))
+        return edge_fields(name, slopes, trust, checked)
 
     def _check_fields(
         self,
@@ -276,20 +291,45 @@ class Integrator(nn.Module, ABC):
         anchor_weight: Tensor | float | None = None,
     ) -> Fields:
         """Validate the arguments of `forward` and bring them to the form of `Fields`; never writes to them."""
+        return self._in_pixels(self._checked(gradient, mask, weight, anchor, anchor_weight))
+
+    def _levelled_fields(
+        self,
+        gradient: Tensor,
+        mask: Tensor | None,
+        weight: Tensor | None,
+        anchor: Tensor | None,
+        anchor_weight: Tensor | float | None,
+    ) -> tuple[Fields, Tensor | None]:
+        """The same with the mean anchor of each component taken off, and this level in the unit of `pixel_size`.
+
+        No method sees how far from 0 its anchors lie, so that none rounds its heights by that; see `level_anchors`.
+        """
+        fields = self._checked(gradient, mask, weight, anchor, anchor_weight)
+        fields, level = level_anchors(fields) if self._follows_offsets else (fields, None)
+        return self._in_pixels(fields), level
+
+    def _checked(
+        self,
+        gradient: Tensor,
+        mask: Tensor | None,
+        weight: Tensor | None,
+        anchor: Tensor | None,
+        anchor_weight: Tensor | float | None,
+    ) -> Fields:
+        """The arguments of `forward` as one batch, found to fit, in the unit of `pixel_size`."""
         name = type(self).__name__
         torus = self._on_torus
         if mask is weight is anchor is anchor_weight is None:
             check_field(name, "gradient", gradient, 2)
-            h = self._unit
-            steps = (self.pixel_size[0] / h, self.pixel_size[1] / h)
-            fields = Fields(gradient if gradient.ndim == 4 else gradient[None], None, None, None, None, steps)
+            fields = Fields(gradient if gradient.ndim == 4 else gradient[None], None, None, None, None, (1.0, 1.0))
             check_values(name, fields)
             return on_torus(name, fields) if torus else fields
         check_accepted(name, self.accepts, torus, mask=mask, weight=weight, anchor=anchor, anchor_weight=anchor_weight)
         check_field(name, "gradient", gradient, 2)
         fields = within_mask(name, fit_fields(name, gradient, mask, weight, anchor, anchor_weight))
         check_values(name, fields)
-        return self._in_pixels(on_torus(name, fields) if torus else fields)
+        return on_torus(name, fields) if torus else fields
 
     @property
     def _on_torus(self) -> bool:

@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_fit, require
-from torchdls._tracing import all_finite, holds_everywhere
+from torchdls._tracing import all_finite, holds_everywhere, only_shapes
 from torchdls.operators import edge_slopes, present_edges
 from torchdls.operators.modes import Boundary
+from torchdls.solvers.components import Gauge, connected_components
+from torchdls.solvers.folding import choose_per_surface
 from torchdls.solvers.units import unit_of
 
 
@@ -99,6 +101,33 @@ def edge_fields(name: str, slopes: Tensor, trust: Tensor | None, fields: Fields)
     return fields._replace(gradient=v, weight=w, on_edges=True)
 
 
+def level_anchors(fields: Fields) -> tuple[Fields, Tensor | None]:
+    """The fields with the mean of the anchors of each component taken off, and what was; None without anchors.
+
+    The mean is weighted by the trust in the anchors. It is (N, 1, H, W), 0 where a component has no anchor, or
+    (N, 1, 1, 1) where all of a surface is one component. A height is its level and what is found for the rest; in
+    single precision the rest, found with anchors 10^6 away, would be worth nothing.
+    """
+    gradient, mask, weight, anchor, r, *_ = fields
+    if anchor is None or r is None:
+        return fields, None
+    bare = mask is None and weight is None
+    linked = None if bare else weight if fields.on_edges else edge_slopes(gradient, mask, weight)[1]
+    nothing = r.new_zeros(len(gradient), 0)
+    labels = nothing.long() if linked is None else choose_per_surface(_labels, linked)[0]
+    most = r.detach().amax((1, 2, 3), keepdim=True).double()
+    trust = (r.double() / torch.where(most > 0, most, 1)).expand(anchor.shape)
+    level = Gauge(labels, nothing, nothing).mean(anchor.double(), trust).to(anchor.dtype)
+    return fields._replace(anchor=torch.where(r > 0, anchor - level, 0)), level
+
+
+def _labels(linked: Tensor) -> tuple[Tensor]:
+    """(N, H * W), of the components of edges with a trust; (N, 0) where there are shapes alone."""
+    if only_shapes(linked):
+        return (linked[:, 0, 0, :0].long(),)
+    return (connected_components(linked > 0).flatten(1),)
+
+
 def check_values(name: str, fields: Fields) -> None:
     """Finite everywhere (within the mask), and no weight negative."""
     inside = "" if fields.mask is None else " inside the mask"
@@ -148,6 +177,15 @@ def has_even_trust(fields: Fields, weight: Tensor | None = None) -> Tensor:
     return full if fields.anchor_weight is None else full & (largest_per_surface(fields.anchor_weight) == 0)
 
 
+def mean_weight(fields: Fields) -> Tensor:
+    """(N, 1, 1, 1), over the weights that are not 0; 1 without weights."""
+    weight = fields.weight
+    if weight is None:
+        return torch.ones_like(fields.gradient[:, :1, :1, :1])
+    total, count = (t.sum((1, 2, 3), keepdim=True) for t in (weight, weight > 0))
+    return torch.where(count > 0, total / count.clamp(min=1), 1)
+
+
 def largest_per_surface(x: Tensor) -> Tensor:
     """(N, 1, 1, 1), the largest value of each surface."""
     return x.flatten(1).amax(1)[:, None, None, None]
@@ -160,6 +198,13 @@ class Units(NamedTuple):
     trust: Tensor
 
 
+def slope_unit(gradient: Tensor) -> Tensor:
+    """(N, 1, 1, 1), the largest power of two in the slopes where their fourth powers are beyond the dtype, else 1."""
+    tame = 2.0**250 if gradient.dtype == torch.float64 else 2.0**30
+    unit = unit_of(gradient.detach().abs().amax((1, 2, 3), keepdim=True))
+    return torch.where((unit > tame) | (unit < 1 / tame), unit, 1)
+
+
 def normalize_fields(fields: Fields, slopes: bool = True) -> tuple[Fields, Units]:
     """The same fields with weights of order 1 and, if `slopes`, slopes whose fourth powers are within the dtype.
 
@@ -170,11 +215,9 @@ def normalize_fields(fields: Fields, slopes: bool = True) -> tuple[Fields, Units
     one = torch.ones_like(g[:, :1, :1, :1])
     trust = one if weight is None else unit_of(weight.detach().abs().amax((1, 2, 3), keepdim=True))
     trust = torch.where((trust > 16) | (trust < 1 / 16), trust, 1)
-    slope, tame, firm = one, *((2.0**250, 2.0**40) if g.dtype == torch.float64 else (2.0**30, 2.0**24))
-    if slopes:
-        unit = unit_of(g.detach().abs().amax((1, 2, 3), keepdim=True))
-        slope = torch.where((unit > tame) | (unit < 1 / tame), unit, 1)
+    slope = slope_unit(g) if slopes else one
     if r is not None:
+        firm = 2.0**40 if g.dtype == torch.float64 else 2.0**24
         least = torch.finfo(r.dtype).tiny  # a weight that is not 0 stays so
         r = torch.where(r > 0, (r / trust).clamp(least, firm), 0)
     return fields._replace(

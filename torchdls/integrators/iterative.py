@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from torch import Tensor
 
@@ -13,7 +13,7 @@ from torchdls.integrators.base import Fields, Integrator
 
 
 class HasHeight(Protocol):
-    """A result that holds a height, among other things."""
+    """A named tuple that holds a height, among other things."""
 
     @property
     def height(self) -> Tensor:
@@ -67,5 +67,7 @@ class Iterative(Integrator, Generic[Result]):
             TypeError: as `forward`.
             ValueError: as `forward`.
         """
-        fields = self._check_fields(gradient, mask, weight, anchor, anchor_weight)
-        return self._to_pixel_size(self._iterate(fields, callback))
+        fields, level = self._levelled_fields(gradient, mask, weight, anchor, anchor_weight)
+        found: Any = self._to_pixel_size(self._iterate(fields, callback))
+        result: Result = found._replace(height=self._placed(found.height, level))
+        return result

@@ -27,6 +27,9 @@ from torchdls.solvers.units import Problem, normalize_problem, plane_of, unit_of
 _PATIENCE = 60
 _LARGEST = 2**22
 
+# Where every pixel is held, those held by so many times the weight of their edges are met by the start.
+_FIRM = 100.0
+
 
 class ConvergenceWarning(UserWarning):
     """An iterative solve reached its limit of iterations before its tolerance.
@@ -370,18 +373,17 @@ def _iterate(b: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, s
     if gauge.labels.shape[1]:
         (b, w, r), unit = _normalize_components(b, w, r, gauge, setting)
         z0 = None if z0 is None else z0 / unit
-    apply, start = normal(w, r, setting), None
-    if gauge.pull.shape[1]:
-        diagonal = edge_ends(w / squares(w, setting)) + r
-        firm = 2 * r > diagonal
-        start = torch.where(firm, b / torch.where(firm, diagonal, 1), 0)
+    apply, start, edges = normal(w, r, setting), None, edge_ends(w / squares(w, setting))
+    firm = r > (edges if gauge.pull.shape[1] else _FIRM * edges)
+    if gauge.pull.shape[1] or bool(firm.any()):
+        start = torch.where(firm, b / torch.where(firm, edges + r, 1), 0)
         b = gauge.balance(b - apply(start))
         z0 = None if z0 is None else z0 - start
     z0 = None if z0 is None else gauge.settle(z0)  # what it says of free constants is not for CG to mend
     patience = _PATIENCE if b[0].numel() * b.shape[0] <= _LARGEST else setting.max_iter
     apart = steep(w, setting) & (patience < setting.max_iter)
     found = conjugate_gradients(
-        apply, preconditioner(w, r, setting.pixel_size, weak=start is not None),
+        apply, preconditioner(w, r, setting.pixel_size, weak=bool(gauge.pull.shape[1])),
         torch.where(apart.view(-1, 1, 1, 1), 0, b) if bool(apart.any()) else b, z0,
         tol=setting.tol, max_iter=min(patience, setting.max_iter), project=gauge.correction(),
         deflate=gauge.deflation(),

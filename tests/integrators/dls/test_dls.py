@@ -89,7 +89,7 @@ def test_objective_never_rises(order, learn, height_step, given):
         {"patch_size": (3, 5), "stride": (2, 3), "n_atoms": 20},
         {"pixel_size": (0.5, 3.0)},
         {"lam": 50.0},
-        {"lam": 1e-3, "mu": 0.0},
+        {"lam": 1e-3, "mu": 1e-3},
         {"lam": torch.tensor([0.1, 5.0]), "mu": torch.tensor([1.0, 0.2])},
     ],
     ids=str,
@@ -311,3 +311,11 @@ def test_patches_side_by_side_need_no_iterative_solve(given, monkeypatch):
         found = dls.solve(g, **fields)
     torch.testing.assert_close(found.height, expected.height, rtol=0, atol=1e-8)
     torch.testing.assert_close(found.objective, expected.objective)
+
+
+@pytest.mark.parametrize("learner", ["soup_dil", "unitary", "dino_kat", "fixed"])
+def test_without_a_threshold_it_is_least_squares(learner):
+    """Patches that are codes of their dictionary cost nothing, so nothing draws the height from the data term."""
+    plane = torch.tensor([0.3, -0.7], dtype=torch.float64).view(1, 2, 1, 1).expand(1, 2, 20, 24)
+    for g in (plane, random_field(1, 2, 20, 24)):
+        torch.testing.assert_close(DLS(mu=0.0, learner=learner)(g), LeastSquares()(g), atol=1e-12, rtol=0)

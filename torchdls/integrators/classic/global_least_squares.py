@@ -271,7 +271,7 @@ class TikhonovRegularization(GlobalLeastSquares):
         fields = self._check_fields(gradient, mask, weight, anchor, anchor_weight)
         z0 = self._prior(prior, gradient) / self._unit
         rest = fields._replace(gradient=fields.gradient - self._slopes(z0, fields.steps))
-        height = (z0 + self._integrate(rest)) * self._unit
+        height = self._finite((z0 + self._integrate(rest)) * self._unit)
         return height if gradient.ndim == 4 else height[0]
 
     if TYPE_CHECKING:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from math import inf
 
 import torch
 from torch import Tensor
@@ -18,6 +19,7 @@ from torchdls.operators.edges import edge_ends
 from torchdls.solvers import ConvergenceWarning
 from torchdls.solvers.components import Gauge, free_constants
 from torchdls.solvers.folding import choose_per_surface
+from torchdls.solvers.units import plane_of
 
 
 class HornBrooks(Integrator):
@@ -33,7 +35,7 @@ class HornBrooks(Integrator):
     The derivative is that of the iterations, and memory grows with them while gradients are recorded.
 
     Args:
-        tol: relative residual of the normal equations at which a surface stops.
+        tol: relative residual of the normal equations, less planes and constants, at which a surface stops.
         max_iter: limit of iterations; a `ConvergenceWarning` says when it was reached.
         relaxation: s, in (0, 2).
         pixel_size: (dx, dy) or one number; heights come out in its unit.
@@ -82,32 +84,40 @@ class HornBrooks(Integrator):
         assert w is not None
         r = w.new_zeros(w.shape[0], 1, 1, 1) if fields.anchor_weight is None else fields.anchor_weight
         held = r.detach().expand(len(w), 1, *w.shape[2:])
-        gauge = Gauge(*choose_per_surface(free_constants, w.detach(), held))
-        b, level = a.adjoint(w * v), torch.zeros_like(w[:, :1])
-        if fields.anchor is not None:  # less its constant, which sweeps would take for ever to find
-            level = gauge.constants(r * fields.anchor, r.expand_as(level))
-            b = b + r * (fields.anchor - level)
+        gauge = Gauge(*choose_per_surface(_constants, w.detach(), held))
+        # Planes and constants are what sweeps would take for ever to find.
+        slope = torch.cat([gauge.mean(v[:, i : i + 1], w[:, i : i + 1]) for i in (0, 1)], 1)
+        plane = plane_of(slope, (w.shape[-2], w.shape[-1]), fields.steps)
+        b, level = a.adjoint(w * (v - slope)), gauge.remove(plane)
+        if fields.anchor is not None:
+            rest = fields.anchor - plane
+            constant = gauge.constants(r * rest, r.expand_as(plane))
+            b, level = b + r * (rest - constant), level + constant
         squares = torch.tensor(fields.steps, dtype=w.dtype, device=w.device).square().view(1, 2, 1, 1)
         diagonal = edge_ends(w / squares) + r
         step = self.relaxation / torch.where(diagonal > 0, diagonal, 1)
         i, j = (torch.arange(n, device=b.device) for n in b.shape[-2:])
         colour = (i[:, None] + j) % 2 == 0
         z = torch.where(2 * r > diagonal, b / torch.where(diagonal > 0, diagonal, 1), 0)  # firm anchors, met at once
-        goal = self.tol * (b - a.adjoint(w * a(z)) - r * z).detach().flatten(1).norm(dim=1)
+        residual = b - a.adjoint(w * a(z)) - r * z  # from here on followed by moves: free of rounding in z
+        goal = self.tol * residual.detach().flatten(1).norm(dim=1)
         active = torch.ones_like(goal, dtype=torch.bool)
         sweeps = torch.zeros_like(goal, dtype=torch.int64)
         for _ in range(self.max_iter):
-            residual = b - a.adjoint(w * a(z)) - r * z
             active = active & (residual.detach().flatten(1).norm(dim=1) > goal)
             if seen_everywhere(~active):
                 break
             sweeps = sweeps + active
-            turn = active.view(-1, 1, 1, 1)
-            z = z + torch.where(turn & colour, step * residual, 0)
-            residual = b - a.adjoint(w * a(z)) - r * z
-            z = z + torch.where(turn & ~colour, step * residual, 0)
+            for turn in (colour, ~colour):
+                move = torch.where(active.view(-1, 1, 1, 1) & turn, step * residual, 0)
+                z, residual = z + move, residual - a.adjoint(w * a(move)) - r * move
         else:
             if is_concrete(active):
                 message = f"HornBrooks: {int(active.sum())} of {len(b)} surfaces above tol={self.tol:g}"
                 warnings.warn(f"{message} after {self.max_iter} iterations", ConvergenceWarning, stacklevel=2)
         return IntegrationResult((gauge.settle(z) + level) * unit.slope, sweeps, ~active)
+
+
+def _constants(w: Tensor, r: Tensor) -> Gauge:
+    """The gauge of every component, however firm its anchors: sweeps find no constant."""
+    return free_constants(w, r, least=inf)

@@ -78,6 +78,7 @@ class LeastSquares(Integrator):
             self.accepts = frozenset({"anchor"})
         self._steady = None if boundary == "dirichlet" else True  # the quadratic does not hold a border
         self._reads_edges = boundary == "neumann"
+        self._follows_offsets = boundary != "dirichlet"  # a border without anchors stays at 0
 
     def _integrate(self, fields: Fields) -> Tensor:
         """Height (N, 1, H, W) in pixels."""

@@ -36,8 +36,10 @@ from torchdls.integrators.dls.settings import (
     choose_learner,
     per_surface,
     register_setting,
+    spans_patches,
 )
 from torchdls.integrators.dls.window import live_window
+from torchdls.integrators.fields import mean_weight, slope_unit
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.settling import run_until_settled
 from torchdls.noise import edge_noise_if_told, noise_if_told
@@ -59,7 +61,8 @@ class DLSResult(NamedTuple):
         dictionary: (N, n, K), or (1, n, K) if shared or fixed; unit-norm atoms.
         codes: (N, K, L), in units of height.
         objective: (N, n_iter + 1), from the start (B = 0) on, for heights in pixels and before their free constant is
-            taken out; it never rises (with one dictionary for the batch, its sum over the batch never does).
+            taken out (for mu="auto" and slopes beyond 2^30 or below 2^-30, float64: 250, that of the same slopes
+            brought to order 1); it never rises (with one dictionary for the batch, its sum over the batch never does).
         noise: (N,) estimated standard deviation of one gradient sample, of mean weight if there are weights.
         lam: (N,) the regularisation weight used.
         mu: (N,) the threshold used, for heights in pixels.
@@ -109,12 +112,13 @@ class DLS(Iterative[DLSResult]):
         patch_size: rows and columns of a patch, or one number for both.
         stride: step between patches, at most the patch size.
         n_atoms: K, the number of atoms of the initial DCT dictionary; ignored if `dictionary` is given.
-        lam: weight of the patch model; a number, a tensor (a number or one per surface), or "auto" (0.5).
-        mu: threshold on the codes; a number, a tensor (a number or one per surface), or "auto": the noise
-            level of one gradient sample, which `noise_level` estimates from the non-integrable part of each field;
-            where there is none, or no cell of 2 x 2 pixels tells it, the height is that of the data term alone. A list
-            or tuple of numbers is a schedule, one for each of the `n_iter` iterations; no surface stops before its last
-            change.
+        lam: weight of the patch model; a number, a tensor (a number or one per surface), or "auto" (0.5, times
+            the mean weight where there are weights).
+        mu: threshold on the codes; a number (0 with a dictionary that spans its patches asks nothing of the height,
+            which is that of the data term), a tensor (a number or one per surface), or "auto": the noise level of one
+            gradient sample, which `noise_level` estimates from the non-integrable part of each field; where there is
+            none, or no cell of 2 x 2 pixels tells it, the height is that of the data term alone. A list or tuple of
+            numbers is a schedule, one for each of the `n_iter` iterations; no surface stops before its last change.
         n_iter: limit of iterations.
         data_term: an integrator built on the solve (*), which provides the data term and the first height.
         dictionary: initial dictionary (n, K), or (N, n, K) for each surface of a batch; atoms are brought to unit
@@ -218,6 +222,18 @@ class DLS(Iterative[DLSResult]):
         return result._replace(height=result.height * self._unit, codes=result.codes * self._unit)
 
     def _iterate(self, fields: Fields, callback: Callback | None = None) -> DLSResult:
+        """The iterations, on slopes of order 1 where the dtype asks for it and no option is a height."""
+        unit = slope_unit(fields.gradient)
+        if not isinstance(self.mu, str) or self._settings.bound < math.inf or seen_everywhere(unit == 1):
+            return self._iterate_as_given(fields, callback)
+        anchor = None if fields.anchor is None else fields.anchor / unit
+        found = self._iterate_as_given(fields._replace(gradient=fields.gradient / unit, anchor=anchor), callback)
+        each = unit.flatten()
+        return found._replace(
+            height=found.height * unit, codes=found.codes * unit[..., 0], noise=found.noise * each, mu=found.mu * each
+        )
+
+    def _iterate_as_given(self, fields: Fields, callback: Callback | None) -> DLSResult:
         """The iterations, within the window of the patches that a mask leaves alive."""
         noise = self._noise(fields)
         if not self.patches.fit(fields.gradient.shape) or (isinstance(self.mu, str) and seen_everywhere(~(noise > 0))):
@@ -305,10 +321,14 @@ class DLS(Iterative[DLSResult]):
         """Everything that stays the same during the iterations."""
         gradient, mask = fields.gradient, fields.mask
         shape, N = gradient.shape[-2:], gradient.shape[0]
-        lam = per_surface("lam", self.lam, _AUTO_LAM * torch.ones_like(noise))
+        lam = per_surface("lam", self.lam, _AUTO_LAM * mean_weight(fields).flatten())
         mu = per_surface("mu", self.mu, _AUTO_MU * noise)
         if isinstance(self.mu, str):  # where there is no noise, or nothing tells it: least squares
             lam, mu = (torch.where(noise > 0, t, 0) for t in (lam, mu))
+        elif not isinstance(self.mu, tuple) and spans_patches(
+            self.dictionary, self.learner
+        ):  # patches that cost nothing: least squares
+            lam = torch.where(mu > 0, lam, 0)  # without a threshold patches cost nothing: least squares
         coverage = self.patches.coverage(shape, dtype=gradient.dtype, device=gradient.device)
         data = self.data_term._data_term(fields)
         schedule = self.mu if isinstance(self.mu, tuple) else None
@@ -323,8 +343,7 @@ class DLS(Iterative[DLSResult]):
         """(N,) noise of a gradient sample of mean weight; NaN where nothing tells it."""
         weight = fields.weight
         if weight is not None:  # a common factor of the weights is no news about the noise
-            count = (weight > 0).sum((-3, -2, -1), keepdim=True).clamp(min=1)
-            weight = weight * count / weight.sum((-3, -2, -1), keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
+            weight = weight / mean_weight(fields)
         if fields.on_edges:
             level, told = edge_noise_if_told(fields.gradient, weight, fields.steps)
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -11,8 +12,9 @@ from torch import Tensor, nn
 
 from torchdls._checks import check_numbers
 from torchdls._registry import LEARNERS
-from torchdls._tracing import holds_everywhere
+from torchdls._tracing import holds_everywhere, is_concrete
 from torchdls.dictionary.learners import DinoKat, FixedDictionary, Learner, SoupDIL
+from torchdls.dictionary.unitary import Unitary
 from torchdls.integrators.dls.options import DERIVATIVES, HEIGHT_STEPS, Exact, Implicit, Proximal, Unroll, meant
 from torchdls.operators import Patches
 
@@ -155,3 +157,10 @@ def check_dictionary(dictionary: Tensor, patches: Patches) -> None:
     norms = dictionary.detach().norm(dim=-2)
     if not holds_everywhere(norms.isfinite() & (norms > 0)):
         raise ValueError("DLS: dictionary has an atom that is zero or not finite")
+
+
+def spans_patches(dictionary: Tensor, learner: Learner) -> bool:
+    """Whether codes of the dictionary make any patch, so that patches cost nothing where codes do not (mu = 0)."""
+    by_threshold = isinstance(learner, SoupDIL | FixedDictionary | DinoKat | Unitary) and learner.bound == math.inf
+    D = dictionary.detach()
+    return by_threshold and is_concrete(D) and bool((torch.linalg.matrix_rank(D) == D.shape[-2]).all())

@@ -88,14 +88,16 @@ class SlopeScale:
         return self.patches.coverage((h + o, w + o), dtype=like.dtype, device=like.device)[..., o:, o:]
 
     def level(self, noise: Noise) -> Tensor:
-        """(N, 1 or 2, 1, 1 or L): noise level of each patch, from its mean trust."""
+        """(N, 1 or 2, 1, 1 or L): noise level of each patch, from its mean trust; without any, that of the surface."""
         level = noise.level[:, None, None, None]
         if noise.trust is None:
             return level
         trust = self.extract(noise.trust)
-        some = (trust > 0).sum(2, keepdim=True)
-        mean = trust.sum(2, keepdim=True) / some.clamp(min=1)
-        return level * torch.where(some > 0, mean, 1).rsqrt()
+        count = (trust > 0).sum(2, keepdim=True)
+        mean = trust.sum(2, keepdim=True) / count.clamp(min=1)
+        usual = noise.trust.sum((1, 2, 3)) / (noise.trust > 0).sum((1, 2, 3)).clamp(min=1)
+        mean = torch.where(count > 0, mean, usual[:, None, None, None])
+        return level * torch.where(mean > 0, mean, 1).rsqrt()
 
     def code_cosines(self, slopes: Tensor, noise: Noise, tau: float, aggregate: Aggregate) -> Coded:
         """Keep the cosine coefficients of each patch and component that exceed tau times their own noise."""
