@@ -8,6 +8,7 @@ from torchdls.dictionary.learners import KSVD, DinoKat, FixedDictionary, Learner
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import soup_dil_sweep
 from torchdls.dictionary.sweep_fused import backends
+from torchdls.dictionary.tiles import TiledSweep, learn_over_tiles, over_ranks
 from torchdls.dictionary.unitary import Unitary
 
 __all__ = [
@@ -18,10 +19,13 @@ __all__ = [
     "Focuss",
     "Learner",
     "SoupDIL",
+    "TiledSweep",
     "Unitary",
     "backends",
     "dct_dictionary",
     "denoise_height",
+    "learn_over_tiles",
     "orthogonal_matching_pursuit",
+    "over_ranks",
     "soup_dil_sweep",
 ]

@@ -217,6 +217,11 @@ def _block_order(R: Tensor, D: Tensor, B: Tensor, rule: _Rule, learn: bool) -> t
     return rule.join(residuals, -1, R), D, rule.join(codes, -1, B)
 
 
+def update_atoms(H: Tensor, C: Tensor, D: Tensor, unused: Unused) -> Tensor:
+    """All atoms in turn, from H = R B^T and C = B B^T, with the residual R of the dictionary D and the codes B."""
+    return _update_atoms(H, C, D, _Rule((), math.inf, "hard", unused, in_place=not is_recorded(H, C, D)))
+
+
 def _total(products: Iterable[Tensor], shared: bool) -> Tensor:
     total = reduce(torch.add, products)
     return total.sum(0, keepdim=True) if shared else total
