@@ -219,7 +219,7 @@ def _block_order(R: Tensor, D: Tensor, B: Tensor, rule: _Rule, learn: bool) -> t
 
 def update_atoms(H: Tensor, C: Tensor, D: Tensor, unused: Unused) -> Tensor:
     """All atoms in turn, from H = R B^T and C = B B^T, with the residual R of the dictionary D and the codes B."""
-    return _update_atoms(H, C, D, _Rule((), math.inf, "hard", unused, in_place=not is_recorded(H, C, D)))
+    return _update_atoms(H, C, D, _Rule(0.0, math.inf, "hard", unused, in_place=not is_recorded(H, C, D)))
 
 
 def _total(products: Iterable[Tensor], shared: bool) -> Tensor:

@@ -10,6 +10,7 @@ from tests.helpers import DISK, random_field, seeded
 from torchdls import SURFACES, LeastSquares, SlopeDLS, add_noise, rmse, ssim
 from torchdls.integrators.slope_dls.bases import Places
 from torchdls.integrators.slope_dls.blend import blend_by_waves, least_in_simplex, signs, sure_weights
+from torchdls.integrators.slope_dls.holed import _around
 from torchdls.integrators.slope_dls.known import Known
 from torchdls.integrators.slope_dls.lines import atoms
 from torchdls.integrators.slope_dls.runs import FOUR, HOLED, Grid, Run, smooth
@@ -411,3 +412,12 @@ def test_blend_under_function_transforms(mapped):
     method(g).square().sum().backward()
     each = torch.vmap(torch.func.grad(lambda x: method(x).square().sum()))(gradient)
     torch.testing.assert_close(each, g.grad, atol=1e-8, rtol=1e-8)
+
+
+@pytest.mark.parametrize("reach", [0, 2, 100])
+def test_the_fill_goes_as_far_as_patches_see(reach):
+    held = torch.zeros(2, 1, 9, 12, dtype=torch.bool)
+    held[0, 0, 3, 4] = held[1, 0, 5, 6] = True
+    expected = torch.zeros(9, 12, dtype=torch.bool)
+    expected[max(0, 3 - reach) : 5 + reach + 1, max(0, 4 - reach) : 6 + reach + 1] = True
+    assert torch.equal(_around(held, reach)[0, 0], expected)

@@ -10,6 +10,8 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torchdls._checks import check_together
+from torchdls._precision import full_precision
 from torchdls._tracing import in_plain_autograd, seen_everywhere
 from torchdls.dictionary import dct_dictionary
 from torchdls.dictionary.learners import Learner
@@ -20,7 +22,8 @@ from torchdls.integrators.dls.checkpoint import run_in_legs
 from torchdls.integrators.dls.choice import Select, check_select, check_selectable, choose_threshold
 from torchdls.integrators.dls.guard import guard
 from torchdls.integrators.dls.implicit import implicit_derivative
-from torchdls.integrators.dls.iteration import Settings, iterate, objective, settled, start
+from torchdls.integrators.dls.iteration import Settings, iterate, objective, settled
+from torchdls.integrators.dls.iteration import start as initial_state
 from torchdls.integrators.dls.options import Unroll
 from torchdls.integrators.dls.problem import Problem, State, last_state
 from torchdls.integrators.dls.settings import (
@@ -221,29 +224,91 @@ class DLS(Iterative[DLSResult]):
         """Height and codes in the unit of `pixel_size`."""
         return result._replace(height=result.height * self._unit, codes=result.codes * self._unit)
 
-    def _iterate(self, fields: Fields, callback: Callback | None = None) -> DLSResult:
+    @full_precision
+    def solve(
+        self,
+        gradient: Tensor,
+        mask: Tensor | None = None,
+        weight: Tensor | None = None,
+        anchor: Tensor | None = None,
+        anchor_weight: Tensor | float | None = None,
+        *,
+        callback: Callback | None = None,
+        start: DLSResult | None = None,
+    ) -> DLSResult:
+        """Integrate as `forward` does, and tell everything that was found on the way.
+
+        Args:
+            gradient: see `forward`, and so for the mask, weight and anchors; a single field is a batch of one.
+            mask: see `forward`.
+            weight: see `forward`.
+            anchor: see `forward`.
+            anchor_weight: see `forward`.
+            callback: called after each iteration as callback(iteration, cost (N,)), with iterations from 1.
+            start: the result of the frame before, for surfaces of the same sizes: the iterations begin with its
+                dictionary and codes in place of the initial dictionary and none, and with the height of the data term
+                as ever. A guess: it carries no derivative.
+
+        Returns:
+            `DLSResult`.
+
+        Raises:
+            TypeError: as `forward`, or `start` is no result of DLS of the same dtype.
+            ValueError: as `forward`; `start` does not fit, or is given beside `Unroll(checkpoint=True)`.
+
+        Example:
+            >>> frames = [torchdls.SURFACES["tent"](32).gradient + 0.1 * torch.randn(1, 2, 32, 32) for _ in range(2)]
+            >>> first = torchdls.DLS(n_iter=10).solve(frames[0])
+            >>> torchdls.DLS(n_iter=3).solve(frames[1], start=first).iterations <= 3
+            tensor([True])
+        """
+        fields, level = self._levelled_fields(gradient, mask, weight, anchor, anchor_weight)
+        if start is not None:
+            self._check_start(start, fields)
+            start = DLSResult(*(t.detach() for t in start))._replace(codes=start.codes.detach() / self._unit)
+        result = self._to_pixel_size(self._iterate(fields, callback, start))
+        return result._replace(height=self._placed(result.height, level))
+
+    def _check_start(self, start: DLSResult, fields: Fields) -> None:
+        if not isinstance(start, DLSResult):
+            raise TypeError(f"DLS: start is a {type(start).__name__}, a DLSResult is needed")
+        check_together("DLS", gradient=fields.gradient, start=start.codes)
+        N, shape = len(fields.gradient), fields.gradient.shape
+        count = math.prod(self.patches.grid(shape)) if self.patches.fit(shape) else 0
+        n, K = self.dictionary.shape[-2:]
+        lone = self._initial_dictionary(fields).shape[0]
+        if start.codes.shape != (N, K, count) or start.dictionary.shape != (lone, n, K):
+            found = f"dictionary {tuple(start.dictionary.shape)} and codes {tuple(start.codes.shape)}"
+            raise ValueError(f"DLS: start has {found}; {(lone, n, K)} and {(N, K, count)} are needed")
+        if isinstance(self._derivative, Unroll) and self._derivative.checkpoint:
+            raise ValueError("DLS: start does not go with derivative=Unroll(checkpoint=True)")
+
+    def _iterate(self, fields: Fields, callback: Callback | None = None, start: DLSResult | None = None) -> DLSResult:
         """The iterations, on slopes of order 1 where the dtype asks for it and no option is a height."""
         unit = slope_unit(fields.gradient)
         if not isinstance(self.mu, str) or self._settings.bound < math.inf or seen_everywhere(unit == 1):
-            return self._iterate_as_given(fields, callback)
+            return self._iterate_as_given(fields, callback, start)
         anchor = None if fields.anchor is None else fields.anchor / unit
-        found = self._iterate_as_given(fields._replace(gradient=fields.gradient / unit, anchor=anchor), callback)
+        start = None if start is None else start._replace(codes=start.codes / unit[..., 0])
+        found = self._iterate_as_given(fields._replace(gradient=fields.gradient / unit, anchor=anchor), callback, start)
         each = unit.flatten()
         return found._replace(
             height=found.height * unit, codes=found.codes * unit[..., 0], noise=found.noise * each, mu=found.mu * each
         )
 
-    def _iterate_as_given(self, fields: Fields, callback: Callback | None) -> DLSResult:
+    def _iterate_as_given(self, fields: Fields, callback: Callback | None, start: DLSResult | None) -> DLSResult:
         """The iterations, within the window of the patches that a mask leaves alive."""
         noise = self._noise(fields)
         if not self.patches.fit(fields.gradient.shape) or (isinstance(self.mu, str) and seen_everywhere(~(noise > 0))):
             return self._without_patches(fields, noise)
         window = live_window(fields.mask, self.patches)
         fields = fields if window is None else window.crop(fields)
-        problem = self._problem(fields, noise)
+        problem = self._problem(fields, noise)._replace(follows=start is not None)
+        if start is not None and window is not None:
+            start = start._replace(codes=window.crop_codes(start.codes))
         if self.select is True:
             problem = choose_threshold(problem, isinstance(self.mu, str), functools.partial(self._trial, problem))
-        result = self._differentiated(problem, callback)
+        result = self._differentiated(problem, callback, start)
         height = remove_free_constants(result.height, fields.mask, fields.anchor_weight)
         followed = result.followed
         if self._guarded:
@@ -270,13 +335,13 @@ class DLS(Iterative[DLSResult]):
     def _settings(self) -> Settings:
         return Settings(self.data_term, self.learner, self.learn, self.height_step, self.tol)
 
-    def _differentiated(self, problem: Problem, callback: Callback | None) -> DLSResult:
+    def _differentiated(self, problem: Problem, callback: Callback | None, start: DLSResult | None = None) -> DLSResult:
         """The result of the iterations, with the derivative that was chosen."""
         how = self._derivative
         if isinstance(how, Unroll):
-            return self._run(problem, callback, how.checkpoint)
+            return self._run(problem, callback, how.checkpoint, start)
         with torch.no_grad():
-            found = self._run(problem, callback)
+            found = self._run(problem, callback, start=start)
         found = DLSResult(*(t.detach() for t in found))
         if how is None:
             return found
@@ -291,12 +356,20 @@ class DLS(Iterative[DLSResult]):
     def _trial(self, problem: Problem, gradient: Tensor, mu: Tensor) -> Tensor:
         """Height of other gradients with another threshold."""
         other = self._problem(problem.fields._replace(gradient=gradient), problem.noise)
-        return self._run(other._replace(lam=problem.lam, mu=mu)).height
+        return self._run(other._replace(lam=problem.lam, mu=mu, follows=False)).height
 
-    def _run(self, problem: Problem, callback: Callback | None = None, checkpoint: bool = False) -> DLSResult:
+    def _run(
+        self,
+        problem: Problem,
+        callback: Callback | None = None,
+        checkpoint: bool = False,
+        start: DLSResult | None = None,
+    ) -> DLSResult:
         """The iterations, until every surface has settled."""
-        settings = self._settings
-        begin = start(problem, self._initial_dictionary(problem.fields), settings)
+        settings, D = self._settings, self._initial_dictionary(problem.fields)
+        if start is not None and self.learn != "fixed":
+            D = start.dictionary
+        begin = initial_state(problem, D, settings, None if start is None else start.codes.clone())
         cost = objective(problem, begin, settings)
         if checkpoint and in_plain_autograd(begin.z, begin.D, problem.lam, problem.mu):
             end = run_in_legs(problem, begin, cost, settings, self.n_iter, callback)

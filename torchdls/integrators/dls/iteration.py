@@ -49,9 +49,13 @@ class Settings(NamedTuple):
         return float(getattr(self.learner, "bound", math.inf))
 
 
-def start(problem: Problem, D: Tensor, settings: Settings) -> State:
-    """The height of the data term alone, and no codes: the patches are the residual."""
+def start(problem: Problem, D: Tensor, settings: Settings, B: Tensor | None = None) -> State:
+    """The height of the data term alone, and no codes: the patches are the residual. Or given codes B."""
     z = settings.data_term._integrate(problem.fields)
+    if B is not None:
+        R = problem.patches.extract(z) - D @ B
+        # An invalid pixel of a patch is filled by its approximation, so that no residual is there.
+        return State(z, z, R if problem.valid is None else torch.where(problem.valid, R, 0), D, B)
     if problem.valid is None:
         R = problem.patches.extract(z)
     else:
@@ -73,7 +77,8 @@ def _extend(problem: Problem, z: Tensor, live: Tensor, settings: Settings) -> Te
 def iterate(problem: Problem, state: State, settings: Settings, iteration: int) -> State:
     """One iteration, counted from 0: codes and atoms for the height, then the height for them."""
     problem = problem.at(iteration)
-    R, D, B = update_codes_and_atoms(problem, state, settings, first=iteration == 0)
+    bare = iteration == 0 and not problem.follows
+    R, D, B = update_codes_and_atoms(problem, state, settings, first=bare)
     z = update_height(problem, state.z, problem.patches.adjoint(R, state.z.shape), settings)
     return State(state.start, z, problem.patches.extract_onto(R, z - state.z), D, B)
 

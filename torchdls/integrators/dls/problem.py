@@ -21,7 +21,7 @@ class Problem(NamedTuple):
 
     coverage (1 or N, 1, H, W) is counted within the mask; valid (N, n, L) marks the valid pixels of the patches; data
     is the data term of the fields; lam and mu are (N,). A schedule holds a threshold for each iteration, mu the last
-    of them.
+    of them. A run that follows another one starts from its codes.
     """
 
     fields: Fields
@@ -33,6 +33,7 @@ class Problem(NamedTuple):
     lam: Tensor
     mu: Tensor
     schedule: tuple[float, ...] | None = None
+    follows: bool = False
 
     def at(self, iteration: int) -> Problem:
         """The problem with the threshold of an iteration, counted from 0."""

@@ -45,6 +45,10 @@ class Window(NamedTuple):
         (top, bottom), (left, right) = ((s.start, m - s.stop) for s, m in zip(self.pixels, self.shape, strict=True))
         return F.pad(image, (left, right, top, bottom))
 
+    def crop_codes(self, codes: Tensor) -> Tensor:
+        """(N, K, L') codes of the patches within the window, out of those of all patches."""
+        return codes.unflatten(-1, self.grid)[(..., *self.patches)].flatten(-2)
+
     def put_codes_back(self, codes: Tensor) -> Tensor:
         """(N, K, L) codes of all patches of the image, zero outside the window."""
         rows, columns = self.patches
