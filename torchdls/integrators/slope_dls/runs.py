@@ -130,7 +130,7 @@ class Run:
         """
         tau, shape = self.threshold(iteration), (slopes.shape[-2], slopes.shape[-1])
         given, slopes = slopes, _turn(slopes) if self.turned else slopes
-        parts = []
+        found = None  # summed scale by scale: no more than one is held beside the sum
         for places in self.places(shape, iteration):
             level = tau * noise[:, None, None, None]
             if boundary == "periodic":
@@ -140,8 +140,9 @@ class Run:
             if self.turned:  # turning back mixes the two components, so they must share one weight
                 weight = part.weight.mean(1, keepdim=True)
                 part = Coded(_turn(part.total / part.weight) * weight, weight)
-            parts.append(part)
-        return average(parts) if known is None else average(parts, given)
+            found = part if found is None else Coded(found.total + part.total, found.weight + part.weight)
+        assert found is not None
+        return average([found]) if known is None else average([found], given)
 
     def _code_around(self, places: Places, slopes: Tensor, level: Tensor, steps: tuple[float, float]) -> Coded:
         """On a torus: laid out flat, so that patches find all their pixels, and folded back."""
