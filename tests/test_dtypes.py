@@ -59,6 +59,7 @@ CALLS = {
     "dlnv_normals": PHOTOMETRIC | {"n_iter": 1},
     "dlpi_normals": PHOTOMETRIC | {"n_iter": 1},
     "edge_slopes": {"gradient": field(2), "mask": mask(), "weight": field(1), "error": torch.ones(1, 1, 1, 1)},
+    "fit_coarse": {"height": field(1), "coarse": field(1), "mask": mask(), "pieces": mask().long()},
     "gradient_to_normals": {"gradient": field(2), "camera": camera()},
     "guess_convention": NORMALS,
     "height_to_points": {"height": field(1)},
@@ -75,7 +76,8 @@ CALLS = {
     "normal_noise": NORMALS,
     "normals_to_gradient": NORMALS,
     "orthogonal_matching_pursuit": {**patches(), "mu": torch.ones(1, 1), "tol": torch.ones(1, 1)},
-    "reconstruct": NORMALS | {"method": "least_squares"},
+    "place_pieces": {"height": field(1), "pieces": mask().long(), "offsets": torch.ones(1, 1)},
+    "reconstruct": NORMALS | {"method": "least_squares", "known": field(1), "coarse": field(1)},
     "refine": {"height": field(1), **PHOTOMETRIC, "albedo": field(1), "n_iter": 1},
     "render": {"normals": field(3), "lights": lights(), "albedo": field(1), "shadow": mask()},
     "ring_of_lights": {},
@@ -176,7 +178,8 @@ def test_the_call_itself_is_right(name, tmp_path):
 @pytest.mark.parametrize("dtype", [torch.int64, torch.float16, torch.complex64], ids=str)
 @pytest.mark.parametrize("name, argument", ARGUMENTS)
 def test_a_wrong_dtype_is_a_type_error_that_names_the_argument(name, argument, dtype, tmp_path):
-    wrong = tensors(name)[argument].to(dtype)
+    wrong = tensors(name)[argument].to(torch.int32 if argument == "pieces" and dtype == torch.int64 else dtype)
+    dtype = wrong.dtype
     label = {("compare_heights", "truth"): "Ground truth"}.get((name, argument), argument)
     label = "height" if argument in ("heights", "depth", "log_depth") and name != "depth_to_points" else label
     with pytest.raises(TypeError, match=rf"{label}\b.*dtype {dtype}|{argument}\b.*dtype {dtype}"):
@@ -193,7 +196,7 @@ def test_a_mask_of_floats_and_a_field_of_bools_are_type_errors(name, argument, t
 
 @pytest.mark.parametrize("name, argument", ARGUMENTS)
 def test_what_is_no_tensor_is_a_type_error(name, argument, tmp_path):
-    if argument in ("scale", "albedo", "mu", "tol", "anchor_weight"):
+    if argument in ("scale", "albedo", "mu", "tol", "anchor_weight", "known"):
         pytest.skip("a number will do")
     wrong = tensors(name)[argument].tolist()
     with pytest.raises(TypeError, match="is a list"):

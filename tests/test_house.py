@@ -29,7 +29,8 @@ MAY_IMPORT |= {
     "plot": {"operators", "geometry", "metrics"},
     "sequences": {"operators", "solvers", "dictionary", "noise"},
     "persistence": {"integrators"},
-    "reconstruction": {"operators", "geometry", "integrators"},
+    "anchors": {"operators", "solvers"},
+    "reconstruction": {"operators", "geometry", "integrators", "anchors"},
     "large": {"operators", "solvers", "noise", "integrators", "geometry"},
     "batch": {"operators", "solvers", "integrators", "geometry", "io"},
     "_registry": {"dictionary", "integrators"},  # for their types alone: it is read before PyTorch is loaded

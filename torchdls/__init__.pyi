@@ -1,6 +1,9 @@
 """The public names and where they live: the one list, for `import torchdls` (see `__init__.py`) and type checkers."""
 
 from . import large as large
+from .anchors import CoarseFit as CoarseFit
+from .anchors import fit_coarse as fit_coarse
+from .anchors import place_pieces as place_pieces
 from .batch import Integrated as Integrated
 from .batch import integrate_many as integrate_many
 from .dictionary import KSVD as KSVD

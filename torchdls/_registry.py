@@ -8,6 +8,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from torchdls.dictionary import Learner
     from torchdls.integrators import Integrator
 
@@ -61,6 +63,20 @@ class Registry(Mapping[str, type[T]]):
     def parameters(self, name: str) -> dict[str, Any]:
         """The options of the method and their defaults."""
         return {p.name: p.default for p in inspect.signature(self[name]).parameters.values()}
+
+
+def camera_options(name: str, camera: Tensor | None) -> dict[str, Any]:
+    """What the integrator of that name is told of a camera K (3, 3) or (N, 3, 3): its `focal_length`, if it takes one.
+
+    Raises:
+        ValueError: it takes one focal length, and the cameras have several.
+    """
+    if camera is None or "focal_length" not in INTEGRATORS.parameters(name):
+        return {}
+    several = camera[..., 0, 0].flatten().tolist()
+    if max(several) > 1.001 * min(several):
+        raise ValueError(f"{name}: cameras of focal lengths {min(several):g} to {max(several):g} given, one is needed")
+    return {"focal_length": several[0]}
 
 
 INTEGRATORS: Registry[Integrator] = Registry(

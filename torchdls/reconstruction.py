@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_fit
 from torchdls._precision import full_precision
-from torchdls._registry import INTEGRATORS
+from torchdls._registry import INTEGRATORS, camera_options
+from torchdls.anchors import fit_coarse
 from torchdls.geometry import (
     depth_to_points,
     height_to_points,
@@ -16,6 +18,8 @@ from torchdls.geometry import (
     normals_to_gradient,
 )
 from torchdls.integrators import Integrator
+
+_COARSE = 1e-5  # weight of a coarse depth: below what ties a surface, above what a cut leaves
 
 
 class Reconstruction(NamedTuple):
@@ -51,6 +55,9 @@ def reconstruct(
     camera: Tensor | None = None,
     convention: str = "opengl",
     method: str | Integrator = "slope_dls",
+    *,
+    known: Tensor | float | None = None,
+    coarse: Tensor | None = None,
 ) -> Reconstruction:
     r"""The surface whose normals are given: `normals_to_gradient`, an integrator, and points.
 
@@ -65,7 +72,13 @@ def reconstruct(
         mask: (N, 1, H, W) or (1, H, W) bool; default: all pixels.
         camera: intrinsics K, (3, 3) or (N, 3, 3), in pixels.
         convention: of the normals, a key of `NORMAL_CONVENTIONS`.
-        method: the name of an integrator, or one that is made; its `pixel_size` is that of the points.
+        method: the name of an integrator, or one that is made; its `pixel_size` is that of the points. What is made by
+            name learns the focal length of the camera, if it asks for one (`Piecewise`, `Bilateral`).
+        known: (N, 1, H, W) heights, or depths under a camera, in their true unit, not finite where unknown: one point
+            is enough for a depth in that unit, one on each piece places all. Or a number: the median of each surface.
+        coarse: (N, 1, H, W) heights or depths of any scale and offset, not finite where unknown, such as a network
+            guesses from one picture or the model of a body has. Both are fitted (`fit_coarse`); then the surface is
+            integrated once more with them as anchors of weight 1e-5, which place pieces that nothing else holds.
 
     Returns:
         `Reconstruction`.
@@ -84,7 +97,7 @@ def reconstruct(
         >>> found.assumed[0]
         'convention opengl: x right, y up, z to the viewer'
     """
-    integrator = _integrator(method)
+    integrator = _integrator(method, camera)
     if camera is not None and integrator.pixel_size != (1.0, 1.0):
         raise ValueError(
             f"reconstruct: pixel_size {integrator.pixel_size} given beside a camera, which already holds it"
@@ -93,7 +106,8 @@ def reconstruct(
     gradient, inside = (t if normals.ndim == 4 else t[None] for t in (field.gradient, field.mask))
     if not bool(inside.flatten(1).any(1).all()):
         raise ValueError(f"reconstruct: no valid normal on a surface of {tuple(normals.shape)} under {convention!r}")
-    found = integrator.solve(gradient, None if bool(inside.all()) else inside)
+    fields = gradient, None if bool(inside.all()) else inside
+    found = solve_with(integrator, *fields, known=known, coarse=coarse, log_depth=camera is not None)
     z = torch.where(inside, found.height, torch.nan)
     depth = None if camera is None else log_depth_to_depth(z)
     points = height_to_points(z, integrator.pixel_size) if camera is None else depth_to_points(_given(depth), camera)
@@ -104,18 +118,56 @@ def reconstruct(
         inside,
         gradient,
         found._asdict().get("noise"),
-        _assumed(convention, camera, integrator, int(field.invalid.sum())),
+        _assumed(convention, camera, integrator, int(field.invalid.sum()), known is not None, coarse is not None),
     )
 
 
-def _integrator(method: str | Integrator) -> Integrator:
+def _integrator(method: str | Integrator, camera: Tensor | None) -> Integrator:
     if isinstance(method, Integrator):
+        if camera is not None and getattr(method, "focal_length", 1) is None:
+            raise ValueError(f"reconstruct: {method!r} given beside a camera, whose focal_length it needs")
         return method
     if not isinstance(method, str):
         raise TypeError(f"reconstruct: method is a {type(method).__name__}, a name or an Integrator is needed")
     if method not in INTEGRATORS:
         raise ValueError(f"reconstruct: method {method!r} is unknown; choose from {', '.join(INTEGRATORS)}")
-    return INTEGRATORS[method]()
+    return INTEGRATORS[method](**camera_options(method, camera))
+
+
+def solve_with(
+    integrator: Integrator,
+    gradient: Tensor,
+    mask: Tensor | None = None,
+    weight: Tensor | None = None,
+    *,
+    known: Tensor | float | None = None,
+    coarse: Tensor | None = None,
+    log_depth: bool = False,
+) -> Any:
+    """What `integrator.solve` returns on (N, C, H, W), with heights or depths that are known, or coarsely known."""
+    inside = torch.ones_like(gradient[:, :1], dtype=torch.bool) if mask is None else mask
+    anchor = pull = torch.zeros_like(gradient[:, :1])
+    if isinstance(known, Tensor):
+        check_fit("reconstruct", "known", known, gradient, "gradient", channels=(1,))
+        given = inside & known.isfinite()
+        if log_depth and not bool((known[given.expand_as(known)] > 0).all()):
+            raise ValueError(f"reconstruct: known {tuple(known.shape)} holds depths that are not positive")
+        anchor = torch.where(given, known, 1)
+        anchor, pull = anchor.log() if log_depth else anchor, given.to(gradient)
+    held = (anchor, pull) if bool((pull > 0).any()) else (None, None)
+    found = integrator.solve(gradient, mask, weight, *held)
+    if coarse is not None:
+        check_fit("reconstruct", "coarse", coarse, gradient, "gradient", channels=(1,))
+        pieces = found._asdict().get("pieces")
+        fit = fit_coarse(found.height.detach(), coarse, inside, pieces, log_depth=log_depth)
+        anchor = torch.where(pull > 0, anchor, fit.anchor)
+        pull = torch.where(fit.known & (pull == 0), _COARSE, pull)
+        found = integrator.solve(gradient, mask, weight, anchor, pull)
+    if isinstance(known, Tensor) or known is None:
+        return found
+    z = torch.where(inside, found.height, torch.nan).flatten(1).nanmedian(1).values[:, None, None, None]
+    middle = torch.where(inside, torch.as_tensor(known).log() if log_depth else known, 0)
+    return found._replace(height=found.height + torch.where(inside, middle - z, 0))
 
 
 def _given(depth: Tensor | None) -> Tensor:
@@ -132,13 +184,17 @@ _FRAMES = {
 }
 
 
-def _assumed(convention: str, camera: Tensor | None, integrator: Integrator, invalid: int) -> tuple[str, ...]:
+def _assumed(
+    convention: str, camera: Tensor | None, integrator: Integrator, invalid: int, known: bool, coarse: bool
+) -> tuple[str, ...]:
     said = [f"convention {convention}: {_FRAMES[convention]}", f"method {integrator!r}"]
     if camera is None:
         dx, dy = integrator.pixel_size
         said += [f"no perspective, pixels of {dx:g} x {dy:g}", "the height of each connected part has mean 0"]
     else:
         said += ["a perspective camera", "the depth of each connected part has geometric mean 1"]
+    if known or coarse:
+        said[-1] = "the scale and offset of the coarse depth are fitted" if coarse else "heights are as known"
     if invalid:
         said.append(f"{invalid} normals inside the mask that are none, turned away or grazing are left out")
     return tuple(said)

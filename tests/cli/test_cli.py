@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from torchdls import LeastSquares, gradient_to_normals, io, normals_to_gradient, rmse
+from torchdls import LeastSquares, Piecewise, gradient_to_normals, io, normals_to_gradient, reconstruct, rmse
 from torchdls.cli.main import main
 from torchdls.geometry import GRADIENT_CONVENTIONS, NORMAL_CONVENTIONS
 from torchdls.surfaces import SURFACES
@@ -175,6 +175,43 @@ def test_perspective_plane_comes_back_as_depth(tmp_path, as_file):
     mesh = trimesh.load_mesh(outs[1])
     normals = mesh.face_normals * [1, -1, -1]  # back to the camera's frame
     np.testing.assert_allclose(normals, np.broadcast_to(n[0, :, 0, 0] / n[0, :, 0, 0].norm(), normals.shape), atol=0.01)
+
+
+def test_known_and_coarse_depths_and_the_focal_length_reach_the_method(tmp_path, capsys):
+    k = torch.tensor([[60.0, 0, 8], [0, 60, 8], [0, 0, 1]], dtype=torch.float64)
+    surface = SURFACES["sphere"](16, dtype=torch.float64)
+    np.save(tmp_path / "n.npy", gradient_to_normals(surface.gradient / 60, "opencv", camera=k))
+    np.savetxt(tmp_path / "k.txt", k.numpy())
+    depth = np.exp(surface.height[0, 0].numpy() / 60)
+    np.save(tmp_path / "coarse.npy", 7 * depth + 2)
+    sparse = np.zeros_like(depth)
+    sparse[4, 5] = 3.0
+    np.save(tmp_path / "sparse.npy", sparse)
+    asked = [
+        "integrate",
+        str(tmp_path / "n.npy"),
+        "--convention",
+        "opencv",
+        "--camera",
+        str(tmp_path / "k.txt"),
+        "--quiet",
+    ]
+
+    def depth_of(name, *options, method="least_squares"):
+        out = str(tmp_path / name)
+        assert main([*asked, "--method", method, *options, "-o", out]) == 0
+        return np.load(out)
+
+    for name, known in (("a.npy", "5,4,3"), ("b.npy", str(tmp_path / "sparse.npy"))):
+        assert abs(depth_of(name, "--known", known)[4, 5] - 3) < 1e-6
+    assert abs(np.median(depth_of("c.npy", "--known", "2.5")) - 2.5) < 0.01
+    fitted = depth_of("d.npy", "--coarse", str(tmp_path / "coarse.npy"))
+    np.testing.assert_allclose(fitted / fitted.mean(), depth / depth.mean(), rtol=2e-3)
+    told = depth_of("e.npy", method="piecewise")
+    made = reconstruct(gradient_to_normals(surface.gradient / 60, camera=k), camera=k, method=Piecewise(60.0)).depth
+    np.testing.assert_allclose(told, made[0, 0].numpy(), rtol=1e-5)
+    assert main([*asked, "--known", "99,4,3", "-o", str(tmp_path / "f.npy")]) == 2
+    assert "--known: '99,4,3' given" in capsys.readouterr().err
 
 
 def test_dls_with_options_and_a_progress_bar(tmp_path, gradient_file, capsys, monkeypatch):

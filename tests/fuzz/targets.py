@@ -211,6 +211,7 @@ ELSEWHERE = {
     "SequencePatches": "tests/sequences",
     "normal_noise": "tests/test_normal_coder.py", "integrate_many": "tests/batch", "reconstruct": "normals_to_gradient",
     "integrate_scattered": "tests/integrators/classic", "shrink_slow_waves": "tests/integrators/slope_dls",
+    "fit_coarse": "tests/test_anchors.py", "place_pieces": "tests/test_anchors.py",
     "ConvergenceWarning": "a warning", "INTEGRATORS": "integrators.py", "LEARNERS": "learner",
 }  # fmt: skip
 

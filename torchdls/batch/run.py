@@ -42,7 +42,7 @@ class Setting:
     Attributes:
         manner: how maps are read.
         method: the name of the method, for the report.
-        make: pixel size -> integrator.
+        make: pixel size and camera -> integrator.
         overwrite: do all maps of the own share anew.
         memory: bytes for what waits, is in work and is being written, beside what one large map needs.
         workers: processes that read; 0 to read in this one.
@@ -55,7 +55,7 @@ class Setting:
 
     manner: Manner
     method: str
-    make: Callable[[tuple[float, float]], Integrator]
+    make: Callable[[tuple[float, float], Tensor | None], Integrator]
     overwrite: bool = False
     memory: int = 2**30
     workers: int = 0
@@ -148,7 +148,7 @@ class Run:
         self, jobs: Sequence[Job], setting: Setting, claims: Claims, report: Report, progress: Progress
     ) -> None:
         self.jobs, self.setting, self.claims, self.report, self.progress = jobs, setting, claims, report, progress
-        self._made: dict[tuple[float, float], Integrator] = {}
+        self._made: dict[tuple[tuple[float, float], float | None], Integrator] = {}
         self._trusted: Trusted = {}
         self._finished: set[int] = set()  # where all maps are done anew, files do not tell
 
@@ -235,14 +235,15 @@ class Run:
         threading.Thread(target=_follow, args=(os.getppid(),), daemon=True).start()
 
     def _method(self, of: Map) -> Integrator:
-        if of.pixel_size not in self._made:
-            self._made[of.pixel_size] = self.setting.make(of.pixel_size)
-        return self._made[of.pixel_size]
+        key = _seen(of)
+        if key not in self._made:
+            self._made[key] = self.setting.make(of.pixel_size, of.camera)
+        return self._made[key]
 
     def _kind(self, read: _Read) -> Hashable | None:
         of = _content(read)
         key = lot_key(Member(0, of.gradient, of.mask, of.weight), self._method(of))
-        return None if key is None else (key, of.pixel_size)
+        return None if key is None else (key, *_seen(of))
 
     def _integrate(self, lot: Sequence[_Read], writer: ThreadPoolExecutor) -> Iterator[tuple[int, Future[None]]]:
         """Sends the results of a lot to be written."""
@@ -307,6 +308,11 @@ def _follow(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(1)
+
+
+def _seen(of: Map) -> tuple[tuple[float, float], float | None]:
+    """Its pixel size and focal length."""
+    return of.pixel_size, None if of.camera is None else float(of.camera[..., 0, 0])
 
 
 def _content(read: _Read) -> Map:

@@ -102,7 +102,7 @@ def _setting(arguments: argparse.Namespace) -> Setting:
     return Setting(
         manner(arguments),
         arguments.method,
-        lambda pixel_size: build_method(arguments.method, pixel_size, arguments.set),
+        lambda pixel_size, camera: build_method(arguments.method, pixel_size, arguments.set, camera=camera),
         overwrite=arguments.force,
         memory=int(arguments.memory * 2**30),
         workers=workers if hasattr(os, "fork") else 0,

@@ -38,6 +38,14 @@ def add_integrate(commands: Any) -> None:
     add("--method", default=METHOD, help=f"{', '.join(INTEGRATORS)} (default: {METHOD})")
     add("--set", action="append", default=[], metavar="NAME=VALUE", help="option of the method, such as lam=0.5")
     add("--mask", metavar="FILE", help="image or array; white or nonzero is valid")
+    add(
+        "--known",
+        metavar="DEPTH",
+        help="heights, or depths under a camera, that are known: a number (the median), a file "
+        "(0 or NaN where unknown), or COLUMN,ROW,DEPTH of one pixel",
+    )
+    add("--coarse", metavar="FILE", help="a depth of any scale and offset, as a network guesses it, that places what "
+        "nothing else ties; NaN, or depth 0, where unknown")  # fmt: skip
     add_manner(command)
     add("--tile", type=int, metavar="N", help="least_squares (also with --mask) or slope_dls of an NPY, Zarr or TIFF "
         "of floats, larger than memory if need be, by N rows (slope_dls: tiles), to NPY, Zarr or BigTIFF")  # fmt: skip
@@ -82,6 +90,7 @@ def _integrate(arguments: argparse.Namespace) -> None:
 
     from torchdls.batch import read_map, write_map
     from torchdls.io.packing import describe
+    from torchdls.reconstruction import solve_with
 
     if arguments.tile is not None:
         return _integrate_large(arguments)
@@ -89,11 +98,15 @@ def _integrate(arguments: argparse.Namespace) -> None:
     check_outputs(arguments.out, arguments.force)
     source = _source(arguments)
     found = read_map(source, manner(arguments))
-    method = build_method(arguments.method, found.pixel_size, arguments.set)
+    method = build_method(arguments.method, found.pixel_size, arguments.set, camera=found.camera)
     start = time.perf_counter()
     with torch.no_grad():
         fields = {"mask": found.mask, "weight": found.weight}
-        result = run_method(arguments.method, method, arguments.quiet, found.gradient, **fields)
+        beside = _beside(arguments, found.gradient, found.camera is not None)
+        if beside:
+            result = solve_with(method, found.gradient, **fields, **beside, log_depth=found.camera is not None)
+        else:
+            result = run_method(arguments.method, method, arguments.quiet, found.gradient, **fields)
     seconds = time.perf_counter() - start
     for note in found.notes:  # now that the method has taken its input: an error is one line alone
         if not arguments.quiet or "warning" in note:
@@ -120,6 +133,47 @@ def _write_picture(path: str, height: Tensor, found: Map, maps: dict[str, Any], 
     shown = Shown(surface, found.mask, found.pixel_size, found.gradient, camera=found.camera, **maps)
     title = f"{Path(arguments.input).name}, {arguments.method}"
     write_picture(path, shown, title=title, unit=arguments.unit, overwrite=arguments.force)
+
+
+def _beside(arguments: argparse.Namespace, gradient: Tensor, deep: bool) -> dict[str, Any]:
+    """What is known of the heights, as `solve_with` takes it."""
+    known, coarse = arguments.known, arguments.coarse
+    return ({} if known is None else {"known": _known(known, gradient, deep)}) | (
+        {} if coarse is None else {"coarse": _depths("--coarse", coarse, gradient, deep)}
+    )
+
+
+def _known(text: str, gradient: Tensor, deep: bool) -> Tensor | float:
+    """A number, a depth at one pixel, or a file of depths."""
+    import torch
+
+    if Path(text).exists():
+        return _depths("--known", text, gradient, deep)
+    try:
+        parts = [float(part) for part in text.split(",")]
+    except ValueError:
+        parts = []
+    if len(parts) == 1:
+        return parts[0]
+    h, w = gradient.shape[-2:]
+    if len(parts) != 3 or not (parts[0] in range(w) and parts[1] in range(h)):
+        raise ValueError(f"--known: {text!r} given, a file, a number or COLUMN,ROW,DEPTH within {w} x {h} is needed")
+    spot = torch.full_like(gradient[:, :1], torch.nan)
+    spot[..., int(parts[1]), int(parts[0])] = parts[2]
+    return spot
+
+
+def _depths(option: str, path: str, gradient: Tensor, deep: bool) -> Tensor:
+    """(1, 1, H, W) of a file, NaN where unknown."""
+    import torch
+
+    from torchdls import io
+
+    depth = io.load_height(path).height.to(gradient)
+    if depth.shape != gradient[:, :1].shape:
+        sizes = f"{tuple(depth.shape[-2:])} given beside an input of {tuple(gradient.shape[-2:])}"
+        raise ValueError(f"{option}: {path} of size {sizes}, the sizes must agree")
+    return torch.where(depth.isfinite() & ((depth != 0) | (not deep)), depth, torch.nan)
 
 
 def _integrate_large(arguments: argparse.Namespace) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from torchdls._registry import INTEGRATORS
+from torchdls._registry import INTEGRATORS, camera_options
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -79,11 +79,15 @@ def _options(settings: Sequence[str]) -> dict[str, Any]:
 
 
 def build_method(
-    name: str, pixel_size: tuple[float, float], settings: Sequence[str] = (), option: str = "--method"
+    name: str,
+    pixel_size: tuple[float, float],
+    settings: Sequence[str] = (),
+    option: str = "--method",
+    camera: Tensor | None = None,
 ) -> Integrator:
-    """The integrator of that name, with options given as words `name=value`."""
+    """The integrator of that name, with options given as words `name=value`, and the focal length of a camera."""
     check_method(name, settings, option)
-    return INTEGRATORS[name](pixel_size=pixel_size, **_options(settings))
+    return INTEGRATORS[name](pixel_size=pixel_size, **camera_options(name, camera) | _options(settings))
 
 
 @contextmanager
