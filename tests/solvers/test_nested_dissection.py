@@ -96,3 +96,24 @@ def test_every_pixel_is_eliminated_once_and_every_edge_enters_once(generator):
     assert torch.equal(pixels, mask.flatten().nonzero()[:, 0])
     n_edges = int((mask[..., 1:] & mask[..., :-1]).sum() + (mask[:, 1:] & mask[:, :-1]).sum())
     assert len(torch.cat([f.edges[1] for f in fronts]).unique()) == n_edges
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [128, 256, 512, 1024])
+@pytest.mark.parametrize("contrast", [0, 6, 12])
+def test_at_most_three_steps_at_any_contrast(size, contrast, generator):
+    """Steps x <- x + M (b - H x) with the factor M, until the residual is 1e-8 of b; weights of closed and open cuts."""
+    w = edges_within(torch.ones(1, 1, size, size, dtype=torch.bool), torch.ones(1, 2, size, size, dtype=torch.float64))
+    y, x = torch.meshgrid(*(torch.arange(size, dtype=torch.float64) / size,) * 2, indexing="ij")
+    waves = torch.sin(9 * x + 4 * torch.sin(7 * y)) + torch.cos(11 * y - 3 * x)
+    inside = torch.nn.functional.pad((waves > 0.7).double(), (0, 1, 0, 1))[None, None]
+    across = torch.cat([inside[..., :-1, 1:], inside[..., 1:, :-1]], 1) != inside[..., :-1, :-1]
+    w = torch.where(across, 10.0**-contrast * w, w)
+    r = torch.full((1, 1, size, size), 1e-8, dtype=torch.float64)
+    A = GradientOperator("forward")
+    b = A.adjoint(w * torch.randn(w.shape, generator=generator, dtype=torch.float64))
+    found, z, steps = factor(w, r), torch.zeros_like(b), 0
+    while (left := b - A.adjoint(w * A(z)) - r * z).norm() > 1e-8 * b.norm():
+        z, steps = z + found.solve(left), steps + 1
+        assert steps <= 3
+    assert steps >= 1
