@@ -102,7 +102,7 @@ def test_every_pixel_is_eliminated_once_and_every_edge_enters_once(generator):
 @pytest.mark.parametrize("size", [128, 256, 512, 1024])
 @pytest.mark.parametrize("contrast", [0, 6, 12])
 def test_at_most_three_steps_at_any_contrast(size, contrast, generator):
-    """Steps x <- x + M (b - H x) with the factor M, until the residual is 1e-8 of b; weights of closed and open cuts."""
+    """Steps x <- x + M (b - H x), M the factor, until the residual is 1e-8 of b; weights jump along closed curves."""
     w = edges_within(torch.ones(1, 1, size, size, dtype=torch.bool), torch.ones(1, 2, size, size, dtype=torch.float64))
     y, x = torch.meshgrid(*(torch.arange(size, dtype=torch.float64) / size,) * 2, indexing="ij")
     waves = torch.sin(9 * x + 4 * torch.sin(7 * y)) + torch.cos(11 * y - 3 * x)
