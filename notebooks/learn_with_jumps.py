@@ -14,7 +14,7 @@
 # %% [markdown]
 # # Learning through a surface that jumps
 #
-# A ramp is hinged to a plane at one side and stands free at the other three. All slopes have the same unknown tilt, as
+# A ramp is hinged to a plane at one side and stands free at two others. All slopes have the same unknown tilt, as
 # by a camera that is not quite square to the scene, and those along x are too large by an unknown factor. Some heights
 # are known. Least squares smears the jumps over the surface, so that no such correction fits; `Piecewise` cuts them,
 # and its derivative is that of the last solve, jumps held fixed.
