@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import re
 from pathlib import Path
 
 from mkdocs.plugins import event_priority
@@ -30,6 +31,7 @@ TABLES = {"INTEGRATORS": "integrators", "LEARNERS": "dictionary", "PHOTOMETRIC":
 
 RESULTS = Path("benchmarks") / "results"
 NOTEBOOKS = Path("notebooks")
+CONTRIBUTING = "<!-- CONTRIBUTING.md -->"
 
 
 @event_priority(100)  # before the plugin that reads notebooks
@@ -44,7 +46,10 @@ def on_files(files: Files, config) -> Files:
 
 
 def on_page_markdown(markdown: str, page, **_) -> str:
-    """Links to them, as the repository has them, lead to their places on the site."""
+    """Links as the repository has them lead to their places on the site; CONTRIBUTING.md becomes a section."""
+    if CONTRIBUTING in markdown:
+        section = re.sub(r"^#", "##", Path("CONTRIBUTING.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+        markdown = markdown.replace(CONTRIBUTING, section)
     for there, here in (("../benchmarks/results/", "benchmarks/"), ("../notebooks/", "notebooks/")):
         markdown = markdown.replace(f"]({there}", f"]({here}")
     return markdown.replace("](CHANGELOG.md)", "")
@@ -96,9 +101,18 @@ def entry(name: str) -> str:
 
 
 def table(name: str) -> str:
-    """A registry: its names, and the first line of what each is."""
+    """A registry: its names, the class or function of each, and the first line of what it is."""
     import torchdls
 
     registry = getattr(torchdls, name)
-    rows = [f"| `{key}` | {registry.summary(key)} |" for key in registry]
-    return "\n".join([f"### {name}\n", "| name | |", "|---|---|", *rows, ""])
+    rows = []
+    for key in registry:
+        value = registry.find(key)
+        link = f"[`{value.__name__}`][{value.__module__}.{value.__name__}]"
+        rows.append(f"| `{key}` | {link} | {in_a_cell(registry.summary(key))} |")
+    return "\n".join([f"### {name}\n", "| name | | |", "|---|---|---|", *rows, ""])
+
+
+def in_a_cell(text: str) -> str:
+    """A line of a docstring as the cell of a table: a bar would end it."""
+    return text.replace("\\sum", "sum").replace("|", "\\|")
