@@ -28,6 +28,7 @@ MAY_IMPORT |= {
     "io": {"geometry"},
     "plot": {"operators", "geometry", "metrics"},
     "sequences": {"operators", "solvers", "dictionary", "noise"},
+    "mesh": set(),
     "persistence": {"integrators"},
     "anchors": {"operators", "solvers"},
     "reconstruction": {"operators", "geometry", "integrators", "anchors"},
