@@ -22,8 +22,8 @@ class SlopeNoise(NamedTuple):
     Attributes:
         covariance: (N, 3, H, W), the entries xx, xy, yy of the symmetric covariance of (dz/dx, dz/dy); 0 where the
             slopes are unknown.
-        weight: (N, 2, H, W), 1 / xx and 1 / yy, the `weight` of an integrator, for each component its own; 0 where
-            the slopes, or their noise, are unknown.
+        weight: (N, 2, H, W), 1 / xx and 1 / yy, the `weight` of an integrator, for each component its own, in units
+            that make its mean 1 over the slopes where it is positive; 0 where the slopes, or their noise, are unknown.
 
     Example:
         >>> noise = torchdls.slope_noise(torch.zeros(1, 3, 4, 5), torch.ones(1, 6, 4, 5))
@@ -82,6 +82,8 @@ def slope_noise(normals: Tensor, covariance: Tensor, *, camera: Tensor | None = 
     variance = spread[:, ::2]
     known = variance > 0
     weight = torch.where(known, 1 / torch.where(known, variance, 1), 0)
+    mean = weight.sum((-3, -2, -1), keepdim=True) / known.sum((-3, -2, -1), keepdim=True).clamp(min=1)
+    weight = weight / torch.where(mean > 0, mean, 1)
     return SlopeNoise(*(t[0] if single else t for t in (spread, weight)))
 
 
