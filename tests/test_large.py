@@ -1,5 +1,6 @@
 """Out of core: least squares equal to the whole, whatever the tiles, the file and the memory; SlopeDLS near to it."""
 
+import os
 from itertools import pairwise
 
 import numpy as np
@@ -342,3 +343,21 @@ def test_what_a_mask_may_not_be():
     assert not z.any()
     with pytest.warns(ConvergenceWarning, match="after 1 iterations"):
         large.integrate(field(30, 30), np.empty((30, 30)), mask=np.tri(30), integrator=LeastSquares(max_iter=1))
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="room on a disk cannot be asked for here")
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path):
+    """A page of a file in memory that finds no room would end the process; a limit stands for the disk here."""
+    import resource
+    import signal
+
+    field = np.zeros((2, 100, 100))
+    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+        with pytest.raises(OSError, match=r"\.npy"):
+            large.integrate(field, np.empty((100, 100)), tile=50, scratch=tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert not list(tmp_path.iterdir())

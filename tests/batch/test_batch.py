@@ -2,6 +2,7 @@
 
 import os
 import random
+import resource
 import signal
 import sys
 import time
@@ -13,6 +14,7 @@ from PIL import Image
 
 from tests.helpers.maps import contents, digests, lines, slopes, start, write_map, write_maps
 from torchdls import io
+from torchdls.batch import Report
 from torchdls.cli.main import main
 
 SIZES = [(32, 32), (16, 48), (32, 32), (70, 66), (16, 48), (32, 32), (20, 18)]
@@ -173,6 +175,20 @@ def test_a_full_disk_ends_the_run(folder, capsys, monkeypatch):
     assert not list((folder / "out" / ".torchdls" / "claims").iterdir())
     monkeypatch.undo()
     assert len(run(folder)) == len(SIZES)
+
+
+def test_a_report_that_cannot_be_written_is_named(tmp_path):
+    """A file may grow to ten bytes, as on a disk with no more room: the rest of the line finds none."""
+    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10, before[1]))
+        with Report(tmp_path / "report.jsonl") as report:
+            for reason in ("No space left", "File too large"):  # a line that is cut, and one with no room at all
+                with pytest.raises(OSError, match=f"{reason}.*report.jsonl"):
+                    report.line(status="done")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
 
 
 def test_other_options_in_one_folder_are_refused(folder, capsys):

@@ -113,3 +113,30 @@ def test_many_threads_take_everything_once(tmp_path):
     with ThreadPoolExecutor(6) as pool:
         took = [i for part in pool.map(work, range(6)) for i in part]
     assert sorted(took) == list(range(100))
+
+
+def test_a_claim_that_cannot_be_signed_is_none(tmp_path, monkeypatch):
+    class Full:
+        """A file on a full disk: it is made, but holds nothing."""
+
+        def __init__(self, path, mode):
+            self.name = str(path)
+            open(path, mode).close()
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            return None
+
+        def write(self, text):
+            raise OSError(28, "No space left on device")
+
+    with Claims(tmp_path) as claims:
+        monkeypatch.setattr("torchdls.batch.claims.open", Full, raising=False)
+        with pytest.raises(OSError, match=rf"No space left on device: '{tmp_path}.*claims") as caught:
+            claims.take("a", lambda: False)
+        assert not list((tmp_path / "claims").iterdir())
+        monkeypatch.undo()
+        assert claims.take("a", lambda: False)
+    assert caught.value.errno == 28

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Self, TextIO
 
 try:
     import fcntl
@@ -81,18 +81,28 @@ class Claims:
         for generation in range(1 << 20):
             place = self._claims / f"{key}.{generation}"
             try:
-                with open(place, "x") as file:
-                    file.write(self._id)
+                file = open(place, "x")  # noqa: SIM115 (`_sign` closes it)
             except FileExistsError:
                 if self._lives(place):
                     return False
                 continue
+            self._sign(file)
             self._held[name] = generation
             if done() or self._failed_since(key):  # by someone who let go between our look and our claim
                 self.release(name)
                 return False
             return True
         return False
+
+    def _sign(self, file: TextIO) -> None:
+        """The owner's name into a claim just made; if it cannot be written, as on a full disk, nothing is claimed."""
+        try:
+            with file:
+                file.write(self._id)
+        except OSError as error:
+            with suppress(OSError):
+                os.unlink(file.name)
+            raise OSError(error.errno, error.strerror, file.name) from error
 
     def release(self, name: str) -> None:
         """Let go of a map that is done, or will not be."""

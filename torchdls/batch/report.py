@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sys
@@ -18,6 +19,7 @@ class Report:
     """Lines of JSON at the end of a file, each written at once; a line that a killed process tore is closed first."""
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
         size = os.fstat(self._file).st_size
         if size and _last_byte(path) != b"\n":
@@ -32,8 +34,18 @@ class Report:
         os.close(self._file)
 
     def line(self, **entries: Any) -> None:
-        """Add one line."""
-        os.write(self._file, (json.dumps(entries) + "\n").encode())
+        """Add one line.
+
+        Raises:
+            OSError: it cannot be written, or not all of it; it names the report.
+        """
+        line = (json.dumps(entries) + "\n").encode()
+        try:
+            written = os.write(self._file, line)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self._path)) from error
+        if written < len(line):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._path))
 
 
 def _last_byte(path: Path) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,9 +109,21 @@ class Passes:
         return found
 
     def scratch(self, name: str, dtype: Any = None) -> Array:
-        """An array of zeros (H, W) in a file of its own, of the dtype of the field if none is given."""
-        dtype = self.field.dtype if dtype is None else dtype
-        found: Array = np.lib.format.open_memmap(self.place / f"{name}.npy", "w+", dtype, self.size)
+        """An array of zeros (H, W) in a file of its own, of the dtype of the field if none is given.
+
+        Its room on the disk is taken at once: a page of a file in memory that finds none ends the process.
+
+        Raises:
+            OSError: the disk has no room for it; it names the file.
+        """
+        dtype, path = self.field.dtype if dtype is None else dtype, self.place / f"{name}.npy"
+        try:
+            found: Array = np.lib.format.open_memmap(path, "w+", dtype, self.size)
+            if hasattr(os, "posix_fallocate"):  # not on macOS and Windows
+                with open(path, "r+b") as file:
+                    os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from error
         return found
 
     def divergence(self, rows: slice, step: tuple[float, float]) -> Tensor:
