@@ -117,3 +117,19 @@ def test_which_surfaces_tell_their_noise():
         level, told = noise_if_told(random_field(3, 2, *size), None, None, (1.0, 1.0))
         assert level.tolist() == [0, 0, 0]
         assert not told.any()
+
+
+@pytest.mark.parametrize("down", [False, True])
+def test_lines_with_holes_and_weights(down):
+    """One row of patches, of which some know nothing: what remains is the cumulative sum of the slopes, noise aside."""
+    g, weight = (
+        torch.full((1, 2, 1, 13), 0.5, dtype=torch.float64),
+        0.5 + torch.arange(13.0).double().view(1, 1, 1, 13) % 3,
+    )
+    mask = torch.ones(1, 1, 1, 13, dtype=torch.bool)
+    mask[..., [0, 1, 8]] = False
+    given = (t.mT if down else t for t in (g, mask, weight))
+    height = SlopeDLS()(*given)
+    height = height.mT if down else height
+    for part in (slice(2, 8), slice(9, 13)):
+        torch.testing.assert_close(height[..., part].diff(), torch.full_like(height[..., part].diff(), 0.5))

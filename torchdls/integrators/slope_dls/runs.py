@@ -170,7 +170,7 @@ class Run:
         if not is_concrete(trust):
             return self._code_patches(places, slopes, level, lambda _: far, trust)
         part, (down, across), at = places.within((trust > 0).any(0).any(0))
-        level = level[:, :, at[0], at[1]] if level.shape[2] > 1 else level
+        level = level[:, :, at[0], at[1]] if level[0, 0].numel() > 1 else level
         coded = self._code_patches(part, slopes[..., down, across], level, lambda _: far, trust[:, :, at[0], at[1]])
         (h, w), (top, left) = places.shape, (down.start, across.start)
         return Coded(*(functional.pad(x, (left, w - across.stop, top, h - down.stop)) for x in coded))
