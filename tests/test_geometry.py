@@ -3,6 +3,7 @@
 import itertools
 
 import kornia
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -365,3 +366,22 @@ def test_nothing_is_made_on_the_default_device():
 def test_bad_input_names_the_argument(error, match, call):
     with pytest.raises(error, match=match):
         call(torch.ones(3, 4, 4))
+
+
+@pytest.mark.parametrize("camera", [None, torch.tensor([[40.0, 0, 8], [0, 40.0, 7], [0, 0, 1]]).double()])
+def test_the_residual_of_each_reading_is_that_of_its_own_slopes(camera):
+    """Readings that differ by signs share their slopes; against each by itself, in NumPy."""
+    generator = torch.Generator().manual_seed(0)
+    normals = torch.randn(2, 3, 12, 15, generator=generator, dtype=torch.float64)
+    normals[:, 2] = normals[:, 2].sign() * (0.3 + normals[:, 2].abs())
+    names, curl, scale = list(NORMAL_CONVENTIONS), {}, 0.0
+    for name in names:
+        field = normals_to_gradient(normals, name, camera=camera)
+        good, (p, q) = field.mask[:, 0].numpy(), field.gradient.numpy().swapaxes(0, 1)
+        cells = good[:, 1:, 1:] & good[:, 1:, :-1] & good[:, :-1, 1:] & good[:, :-1, :-1]
+        a = np.diff((q[:, 1:] + q[:, :-1]) / 2, axis=2)[cells]
+        b = np.diff((p[:, :, 1:] + p[:, :, :-1]) / 2, axis=1)[cells]
+        curl[name] = np.abs(a - b).sum() if cells.any() else np.inf
+        scale = max(scale, (np.abs(a) + np.abs(b)).sum())
+    found = guess_convention(normals, candidates=names, camera=camera)
+    assert found.residual == pytest.approx({name: value / scale for name, value in curl.items()}, rel=1e-12)

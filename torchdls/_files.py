@@ -54,7 +54,8 @@ def atomic_file(path: str | os.PathLike[str], overwrite: bool = False) -> Iterat
     """A binary file that takes its place when the block ends without an error, and else leaves no trace.
 
     What replaces a file keeps its permissions, and a symbolic link goes on pointing to it. Of several writers without
-    `overwrite` exactly one succeeds. A draft that a killed writer left is removed by the next write to the same name.
+    `overwrite` exactly one succeeds. A draft that a killed writer left is removed by the next write to the same name
+    (that of one beside another: by the next that finds the name taken).
 
     Raises:
         FileNotFoundError: the directory does not exist.
@@ -64,7 +65,6 @@ def atomic_file(path: str | os.PathLike[str], overwrite: bool = False) -> Iterat
     path = check_output(path, overwrite)
     place = Path(os.path.realpath(path)) if overwrite else path
     try:
-        _sweep(place)
         file = _draft(place)
     except OSError as error:
         raise _naming_output(path, error) from error
@@ -90,10 +90,19 @@ def atomic_file(path: str | os.PathLike[str], overwrite: bool = False) -> Iterat
 
 
 def _draft(place: Path) -> BinaryIO:
-    """A new file beside its place, locked while its writer lives."""
+    """A new file beside its place, locked while its writer lives.
+
+    Each place has one name for its draft, and only a writer that finds it taken lists the folder to look for the dead.
+    """
+    tries = 0
     while True:
-        name = place.with_name(f".{place.name}.{secrets.token_hex(4)}.draft")
-        file = open(name, "xb")  # noqa: SIM115 (the caller closes it)
+        name = "0" * 8 if tries < 2 else secrets.token_hex(4)
+        tries += 1
+        try:
+            file = open(place.with_name(f".{place.name}.{name}.draft"), "xb")  # noqa: SIM115 (the caller closes it)
+        except FileExistsError:
+            _sweep(place)
+            continue
         if fcntl is None:
             return file
         with suppress(OSError):  # a file system without locks: nobody can sweep there either

@@ -19,7 +19,7 @@ so the logarithm of the depth is integrated like a height, and its free constant
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -283,21 +283,30 @@ def guess_convention(
         'directx'
     """
     check_field("guess_convention", "normals", normals, 3)
-    curl, scale = {}, 0.0
+    curl, scale, known = {}, 0.0, dict[Hashable, tuple[int, Tensor, Tensor, bool]]()
     for name in candidates:
-        field = normals_to_gradient(normals.detach(), name, mask=mask, camera=camera)
-        pairs = field.mask[..., 1:] & field.mask[..., :-1]
-        cells = pairs[..., 1:, :] & pairs[..., :-1, :]
-        gx, gy = field.gradient.split(1, -3)
-        slope_y, slope_x = (gy[..., 1:, :] + gy[..., :-1, :]) / 2, (gx[..., 1:] + gx[..., :-1]) / 2
-        a, b = slope_y.diff(dim=-1) * cells, slope_x.diff(dim=-2) * cells
+        axes = lookup(NORMAL_CONVENTIONS, "convention", name)
+        hand = axes[0][1] * axes[1][1]  # readings that differ by signs of x and y alone differ by that of one term
+        frame = name if camera is not None else (axes[0][0], axes[1][0], axes[2])
+        if frame not in known:
+            known[frame] = hand, *_twists(normals_to_gradient(normals.detach(), name, mask=mask, camera=camera))
+        first, a, b, some = known[frame]
         # A plane is a surface in every reading; a reading without any cell is none.
-        curl[name] = float((a - b).abs().sum()) if cells.any() else float("inf")
+        curl[name] = float((a - b if hand == first else a + b).abs().sum()) if some else float("inf")
         scale = max(scale, float((a.abs() + b.abs()).sum()))
     residual = {name: value / (scale or 1.0) for name, value in curl.items()}
     if not residual or min(residual.values()) == float("inf"):
         raise ValueError(f"normals: no 2x2 cell of valid pixels in any of the conventions {', '.join(candidates)}")
     return ConventionGuess(min(residual, key=residual.__getitem__), residual)
+
+
+def _twists(field: GradientField) -> tuple[Tensor, Tensor, bool]:
+    """D_x g_y and D_y g_x on the complete 2x2 cells, and whether there are any."""
+    pairs = field.mask[..., 1:] & field.mask[..., :-1]
+    cells = pairs[..., 1:, :] & pairs[..., :-1, :]
+    gx, gy = field.gradient.split(1, -3)
+    slope_y, slope_x = (gy[..., 1:, :] + gy[..., :-1, :]) / 2, (gx[..., 1:] + gx[..., :-1]) / 2
+    return slope_y.diff(dim=-1) * cells, slope_x.diff(dim=-2) * cells, bool(cells.any())
 
 
 def _length(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
