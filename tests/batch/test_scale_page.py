@@ -13,7 +13,8 @@ from tests.helpers.maps import contents, write_maps
 from torchdls.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[2]
-CLASS, CALL = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "scale.md").read_text(encoding="utf-8"), re.DOTALL)
+PAGE = (ROOT / "docs" / "scale.md").read_text(encoding="utf-8")
+CLASS, CALL = (re.findall(rf"```{word}\n(.*?)```", PAGE, re.DOTALL)[0] for word in ("python", "py"))
 
 
 def write_inputs(folder):
