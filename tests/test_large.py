@@ -234,7 +234,7 @@ def test_tiles_are_blended_in_their_slopes_and_solved_once(guard):
     for rows, p in spans(90, 20, 8):
         for columns, q in spans(70, 20, 8):
             part = gradient[..., rows, columns]
-            start, height = blended(integrator.exact_runs, part, level, Grid(step), guard is not None)
+            start, height = blended(integrator._exact_runs, part, level, Grid(step), guard is not None)
             slopes[..., rows, columns] += p[:, None] * q * a(height - start)
     smooth = solve(slopes, pixel_size=step).height
     expected = shrink_slow_waves(smooth, reference, level, step, 24.0)

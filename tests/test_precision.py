@@ -25,6 +25,9 @@ P, D = (
     torch.nn.functional.normalize(random_field(1, 9, 12, dtype=F32), dim=1),
 )
 B = torch.zeros(1, 12, 20)
+covariance = torch.tensor([1.0, 0.1, 0.0, 1.0, 0.2, 1.0]).view(1, 6, 1, 1).expand(1, 6, 16, 14).contiguous()
+corners = torch.tensor([[0.0, 0, 1], [1, 0, 1], [1, 1, 2], [0, 1, 1]])
+faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
 big = random_field(1, 1, 70, 80, seed=4, dtype=F32)
 noisy = lambda g: torchdls.add_noise(g, 10, torch.Generator().manual_seed(0))  # noqa: E731
 
@@ -45,6 +48,8 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "dls_objective": (lambda z, g, d, b: dls_objective(z, g, d, b, 0.5, 0.1, patches=Patches(3, 3)), z[..., :15, :12],
                       g[..., :15, :12], D, B),
     "edge_slopes": (lambda g: torchdls.edge_slopes(g)[0], g),
+    "fit_coarse": (lambda a, b: torchdls.fit_coarse(a, b).anchor, z, z.square() + 1),
+    "fit_mesh": (lambda v: torchdls.fit_mesh(v, faces, v[:2], n_iter=2).vertices, corners),
     "gradient_to_normals": (torchdls.gradient_to_normals, g),
     "GradientToNormals": (torchdls.GradientToNormals(), g),
     "GradientOperator": (GradientOperator(((((0.1, 0.5, 0.2),) * 3), (((0.1, 0.5, 0.2),) * 3))), z),
@@ -64,6 +69,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "normals_to_gradient": (lambda n, k: torchdls.normals_to_gradient(n, camera=k).gradient, n, camera),
     "NormalsToGradient": (torchdls.NormalsToGradient(camera=camera), n),
     "orthogonal_matching_pursuit": (lambda p, d: orthogonal_matching_pursuit(p, d, 3), P, D),
+    "place_pieces": (lambda z, o: torchdls.place_pieces(z, torch.ones_like(z).long(), o), z, z[:, 0, :1, 0]),
     "Patches": (Patches(4, 2).extract, z),
     "Patches.adjoint": (lambda x: Patches(3, 3).adjoint(x, (12, 15)), P),
     "reconstruct": (lambda n: torchdls.reconstruct(n, method="least_squares").height, n),
@@ -73,6 +79,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "select": (lambda g: torchdls.select(lambda x: torchdls.HarkerOLeary()(x), g, 1).height, g),
     "shrink_slow_waves": (lambda a, b: torchdls.shrink_slow_waves(a, b, 0.1 * torch.ones(1)), z, z.square()),
     "solve": (lambda g: torchdls.solve(g, g.abs()).height, g),
+    "slope_noise": (lambda n, c: torchdls.slope_noise(n, c).covariance, n, covariance),
     "soup_dil_sweep": (lambda p, d: soup_dil_sweep(p, d, B, 0.1)[1], P, D),
     "sparse_normals": (lambda i, k: torchdls.sparse_normals(i, k, n_iter=5).normals, images, lights),
     "ssim": (lambda a, b: torchdls.ssim(a, b, 4.0), z, z.square()),
@@ -88,7 +95,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
 }  # fmt: skip
 # What takes no tensor, gives no tensor, reads or draws a file, or is tested over its registry.
 OTHERS = {
-    "integrate_many",
+    "backends", "integrate_many",
     "ring_of_lights", "dct_dictionary", "terrain", "guess_convention", "build", "load", "save", "load_camera",
     "load_field", "load_height", "load_mask", "load_photographs", "save_normals", "save_height", "save_mesh",
     "compare_heights", "hillshade", "page_html", "surface_page", "surface_preview",

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_alike, check_field, check_fit
+from torchdls._precision import full_precision
 from torchdls._statistics import masked_median
 from torchdls.operators import edge_slopes
 from torchdls.solvers import connected_components
@@ -37,6 +38,7 @@ class CoarseFit(NamedTuple):
     offset: Tensor
 
 
+@full_precision
 def fit_coarse(
     height: Tensor,
     coarse: Tensor,
@@ -161,6 +163,7 @@ def _fit_log(z: Tensor, c: Tensor, known: Tensor, label: Tensor) -> tuple[Tensor
     return a[:, 1], b
 
 
+@full_precision
 def place_pieces(height: Tensor, pieces: Tensor, offsets: Tensor) -> Tensor:
     """The height with each piece moved by its own offset.
 

@@ -126,7 +126,7 @@ def test_functional_transforms_agree(name: str, label: str) -> None:
         with pytest.raises(RuntimeError, match="data-dependent control flow"):
             torch.vmap(integrator)(g)
     else:
-        torch.testing.assert_close(torch.vmap(integrator)(g), separate, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(torch.vmap(integrator)(g), separate, rtol=1e-7, atol=1e-7)  # solves stop elsewhere
     _, tangent = torch.func.jvp(integrator, (g[0],), (direction,))
     _, pull = torch.func.vjp(integrator, g[0])
     torch.testing.assert_close((tangent * back).sum(), (pull(back)[0] * direction).sum(), rtol=1e-8, atol=1e-9)

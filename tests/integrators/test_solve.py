@@ -94,7 +94,7 @@ def test_shows_what_a_user_calls_alone(name: str) -> None:
     """Beside what every module has: the call, `solve`, options, and those of the method itself."""
     integrator = method(name).build(name)
     own = {n for n in dir(integrator) if not n.startswith("_")} - set(dir(nn.Module()))
-    options = set(INTEGRATORS.parameters(name)) | {"accepts", "options", "solve"}
+    options = set(INTEGRATORS.parameters(name)) | {"accepts", "from_edges", "options", "solve"}
     more = {
         "dls": {"patches"},
         "slope_dls": {"fast"},

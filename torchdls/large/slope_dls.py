@@ -81,7 +81,7 @@ def slope_dls(passes: Passes, integrator: SlopeDLS, windows: Windows, level: Ten
     for rows in passes.bands():
         base[rows] = rows_forward(passes.divergence(rows, steps))
         change[rows] = rows_forward(as_tensor(change[rows]))
-    factors, share = _finish(passes, base, change, level, steps, slow_period(integrator.exact_runs))
+    factors, share = _finish(passes, base, change, level, steps, slow_period(integrator._exact_runs))
     share = 1.0 if integrator.guard is None else share
     for columns in passes.strips():
         z, d = (as_tensor(x[:, columns].T) for x in (base, change))
@@ -127,7 +127,7 @@ def _smooth(
         passes.say(f"row {k + 1} of {len(windows[0])}, {len(windows[1])} tiles")
         for across in windows[1]:
             gradient = passes.field.slopes(down.pixels, across.pixels)[None]
-            start, height = blended(integrator.exact_runs, gradient, level, Grid(steps), guard)
+            start, height = blended(integrator._exact_runs, gradient, level, Grid(steps), guard)
             weight = (down.weight[:, None] * across.weight).to(gradient)
             change[down.pixels, across.pixels] += a.adjoint(weight * a(height - start))[0, 0].numpy()
 

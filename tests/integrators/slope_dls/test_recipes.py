@@ -416,8 +416,9 @@ def test_blend_under_function_transforms(mapped):
 
 @pytest.mark.parametrize("reach", [0, 2, 100])
 def test_the_fill_goes_as_far_as_patches_see(reach):
-    held = torch.zeros(2, 1, 9, 12, dtype=torch.bool)
-    held[0, 0, 3, 4] = held[1, 0, 5, 6] = True
-    expected = torch.zeros(9, 12, dtype=torch.bool)
-    expected[max(0, 3 - reach) : 5 + reach + 1, max(0, 4 - reach) : 6 + reach + 1] = True
-    assert torch.equal(_around(held, reach)[0, 0], expected)
+    held = torch.zeros(3, 1, 9, 12, dtype=torch.bool)
+    held[0, 0, 3, 4] = held[0, 0, 5, 6] = held[1, 0, 8, 0] = True
+    expected = torch.zeros(3, 9, 12, dtype=torch.bool)
+    expected[0, max(0, 3 - reach) : 5 + reach + 1, max(0, 4 - reach) : 6 + reach + 1] = True
+    expected[1, max(0, 8 - reach) :, : reach + 1] = True  # each surface has its own window, the last one none
+    assert torch.equal(_around(held, reach)[:2, 0], expected[:2])

@@ -115,7 +115,9 @@ class HornBrooks(Integrator):
             if is_concrete(active):
                 message = f"HornBrooks: {int(active.sum())} of {len(b)} surfaces above tol={self.tol:g}"
                 warnings.warn(f"{message} after {self.max_iter} iterations", ConvergenceWarning, stacklevel=2)
-        return IntegrationResult((gauge.settle(z) + level) * unit.slope, sweeps, ~active)
+        z = gauge.remove(z)
+        z = z - gauge.constants(r * z, r.expand_as(z))  # 0 at the end, but for what its derivative knows of r
+        return IntegrationResult((z + level) * unit.slope, sweeps, ~active)
 
 
 def _constants(w: Tensor, r: Tensor) -> Gauge:

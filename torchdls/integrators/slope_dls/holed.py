@@ -20,7 +20,7 @@ from torchdls.operators.edges import edge_ends, extend_edges
 from torchdls.solvers import harmonic_extension, solve
 
 _NORM = 0.25  # of the risk, see `sure_weights`
-_FILLED = 1e-2  # relative residual of the extension from which runs begin: a fill that they improve themselves
+_FILLED = 1e3  # times the tolerance of the solves, for the extension from which runs begin: they improve it themselves
 
 
 def _nothing(z: Tensor) -> None:
@@ -108,7 +108,7 @@ class _Surface:
     def run(self, run: Run, start: Tensor, level: Tensor, watch: Callable[[Tensor], None] = _nothing) -> Tensor:
         """The height after all iterations of a run."""
         v, w = edge_slopes(*self.fields[:3])
-        valid, coded = continued(start, w, self.fields.steps, max(self.tol, _FILLED), max(run.sizes))
+        valid, coded = continued(start, w, self.fields.steps, _FILLED * self.tol, max(run.sizes))
         valid = torch.ones_like(v, dtype=torch.bool) if valid is None else valid
         known = Known(valid.to(v), None if self.noise_trust is None else extend_edges(self.noise_trust))
         a, z = GradientOperator("forward", self.fields.steps), start
@@ -132,20 +132,21 @@ def continued(
         return None, z
     held = edge_ends(w) > 0
     if not is_concrete(held) or not bool(held.all()):
-        known = reach is not None and is_concrete(held) and bool(held.any())
-        region = _around(held, reach or 0) if known else None
+        region = None if reach is None else _around(held, reach)
         z = harmonic_extension(z, held, region, tol=tol, pixel_size=steps)
     return extend_edges(w) > 0, extend_edges(GradientOperator("forward", steps)(z))
 
 
 def _around(held: Tensor, reach: int) -> Tensor:
-    """(1, 1, H, W) bool: the window of the held pixels of all surfaces, so many pixels larger on every side."""
-    found = held.any(0)[0]
+    """(N, 1, H, W) bool: the window of the held pixels of each surface, so many pixels larger on every side."""
     near = []
-    for hit in (found.any(1), found.any(0)):
-        at, alive = torch.arange(len(hit), device=held.device), hit.nonzero()
-        near.append((at >= alive.min() - reach) & (at <= alive.max() + reach))
-    return (near[0][:, None] & near[1])[None, None]
+    for dim in (-1, -2):
+        hit = held.any(dim, keepdim=True)
+        at = torch.arange(hit.numel() // len(hit), device=held.device).view(hit.shape[1:])
+        first = torch.where(hit, at, at.numel()).amin((-2, -1), keepdim=True)
+        last = torch.where(hit, at, -1).amax((-2, -1), keepdim=True)
+        near.append((at >= first - reach) & (at <= last + reach))
+    return near[0] & near[1]
 
 
 def _probe(fields: Fields, noise: Noise) -> Tensor:

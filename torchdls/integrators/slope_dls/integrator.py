@@ -236,7 +236,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
         return [replace(run, **given) for run in runs]
 
     @property
-    def exact_runs(self) -> list[Run]:
+    def _exact_runs(self) -> list[Run]:
         """The runs of the recipe for full rectangles with equal trust; none for "plain"."""
         return self._runs(_RUNS[self.recipe])
 
@@ -290,7 +290,7 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
                 callback(len(misfit) - 1, misfit[-1].detach())
 
         guarded = self.guard is not None
-        height = smooth(self.exact_runs, fields.gradient, noise.overall, grid, guarded, watch)
+        height = smooth(self._exact_runs, fields.gradient, noise.overall, grid, guarded, watch)
         return SlopeDLSResult(height, None, None, torch.stack(misfit, 1), noise.level, height)
 
     def _plain(self, fields: Fields, noise: Noise, callback: Callback | None = None) -> SlopeDLSResult:
