@@ -92,10 +92,20 @@ def _plane(slope: Tensor, h: int, w: int, dx: float, dy: float) -> Tensor:
 
 @table
 def _spectra(n: int, sigma: float) -> Tensor:
-    """(2, 2 n): Fourier transform of the bump on a ring of 2 n pixels, and that of its derivative over i."""
-    turns = max(1, math.ceil(10 * sigma / (2 * n)))
+    """(2, 2 n): Fourier transform of the bump on a ring of 2 n pixels, and that of its derivative over i.
+
+    Sharp bumps are summed around the ring, wide ones, by Poisson's formula, over the periods of their own transform.
+    """
+    turn = torch.arange(-2, 3, dtype=torch.float64, device="cpu")[:, None]
     x = torch.arange(2 * n, dtype=torch.float64, device="cpu")
-    x = x + 2 * n * torch.arange(-turns, turns + 1, dtype=torch.float64, device="cpu")[:, None]
+    if sigma > 1:
+        frequency = 2 * math.pi * (x / (2 * n) + turn)
+        whole = math.sqrt(2 * math.pi) * sigma * torch.exp(-0.5 * (sigma * frequency).square())
+        value, slope = whole.sum(0), (frequency * whole).sum(0)
+        slope[0] = slope[n] = 0.0
+        return torch.stack([value, slope])
+    reach = torch.arange(-(10 // (2 * n) + 1), 10 // (2 * n) + 2, dtype=torch.float64, device="cpu")[:, None]
+    x = x + 2 * n * reach
     bump = torch.exp(-x.square() / (2 * sigma**2))
     value = torch.fft.fft(bump.sum(0)).real.clamp(min=0)
     slope = torch.fft.fft((-x / sigma**2 * bump).sum(0)).imag

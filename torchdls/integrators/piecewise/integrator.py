@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchdls._checks import check_numbers
 from torchdls._tracing import is_concrete
 from torchdls.dictionary.normals import code_normals, curl_noise
 from torchdls.integrators.base import Fields
@@ -134,6 +135,8 @@ class Piecewise(Iterative[PiecewiseResult]):
         pixel_size: float | Sequence[float] = 1.0,
     ) -> None:
         super().__init__(pixel_size=pixel_size)
+        given = {"focal_length": focal_length, "noise": noise}
+        check_numbers("Piecewise", solve_tol=solve_tol, **{name: x for name, x in given.items() if x is not None})
         if focal_length is not None and not 0 < focal_length < float("inf"):
             raise ValueError(f"Piecewise: focal_length={focal_length!r} given, a positive number or None is needed")
         if noise is not None and not 0 <= noise < 1:
