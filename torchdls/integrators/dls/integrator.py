@@ -62,7 +62,7 @@ class DLSResult(NamedTuple):
     Attributes:
         height: (N, 1, H, W).
         dictionary: (N, n, K), or (1, n, K) if shared or fixed; unit-norm atoms.
-        codes: (N, K, L), in units of height.
+        codes: (N, K, L), in units of height; with anchors, of the height less the mean anchor of each component.
         objective: (N, n_iter + 1), from the start (B = 0) on, for heights in pixels and before their free constant is
             taken out (for mu="auto" and slopes beyond 2^30 or below 2^-30, float64: 250, that of the same slopes
             brought to order 1); it never rises (with one dictionary for the batch, its sum over the batch never does).
