@@ -136,6 +136,8 @@ class MEstimator(Robust):
         if loss not in LOSSES:
             raise ValueError(f"MEstimator: loss={loss!r} is unknown; choose from {', '.join(map(repr, LOSSES))}")
         check_numbers("MEstimator", floor=floor)
+        if not isinstance(joint, bool):
+            raise TypeError(f"MEstimator: joint is a {type(joint).__name__}, True or False is needed")
         if not 0 < floor < float("inf"):
             raise ValueError(f"MEstimator: floor={floor!r} given, a positive number is needed")
         self.loss, self.floor, self.joint = loss, floor, joint
