@@ -16,6 +16,9 @@ JOBS ?= 2
 DEMO ?= demo
 PYTEST_ARGS ?=
 
+# Threads that wait sleep: two processes on two cores spin each other to a crawl otherwise.
+export OMP_WAIT_POLICY := PASSIVE
+
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet $(addprefix --extra-index-url ,$(TORCH_INDEX)) $(TORCH)
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS)
