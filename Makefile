@@ -93,7 +93,8 @@ bench-smoke: $(VENV)/.dev
 
 check: test check-rest
 
-check-rest: test-slow lint types docs notebooks bench-smoke
+check-rest: test-slow lint types docs
+	OMP_NUM_THREADS=1 $(MAKE) --jobs=2 notebooks bench-smoke
 
 clean:
 	rm -rf $(SCRATCH) $(DEMO) .mypy_cache .pytest_cache .ruff_cache
