@@ -126,7 +126,8 @@ def test_functional_transforms_agree(name: str, label: str) -> None:
         with pytest.raises(RuntimeError, match="data-dependent control flow"):
             torch.vmap(integrator)(g)
     else:
-        torch.testing.assert_close(torch.vmap(integrator)(g), separate, rtol=1e-7, atol=1e-7)  # solves stop elsewhere
+        tol = 1e-7 if name == "piecewise" else 1e-9  # its solves take another way where values cannot be looked at
+        torch.testing.assert_close(torch.vmap(integrator)(g), separate, rtol=tol, atol=tol)
     _, tangent = torch.func.jvp(integrator, (g[0],), (direction,))
     _, pull = torch.func.vjp(integrator, g[0])
     torch.testing.assert_close((tangent * back).sum(), (pull(back)[0] * direction).sum(), rtol=1e-8, atol=1e-9)
