@@ -22,13 +22,13 @@ from torchdls.photometric.refine import _misfit, _reflect, _scene, _step
 LIGHTS = ring_of_lights(4, 35.0, dtype=torch.float64) * torch.tensor([1.0, 0.8, 1.2, 1.0]).double()[:, None]
 
 
-def scene_of(images, albedo=None, mask=None):
-    return _scene(check("refine", images, LIGHTS, mask, None), albedo, mask, (1.0, 1.0))
+def scene_of(images, albedo=None, mask=None, lights=LIGHTS):
+    return _scene(check("refine", images, lights, mask, None, least=2), albedo, mask, (1.0, 1.0))
 
 
-def exact(height, albedo):
+def exact(height, albedo, lights=LIGHTS):
     """Images that both triangles of a pixel give; at pixels where they differ, the sum is least at their mean."""
-    scene = scene_of(torch.zeros(1, 4, *height.shape[-2:], dtype=torch.float64))
+    scene = scene_of(torch.zeros(1, len(lights), *height.shape[-2:], dtype=torch.float64), lights=lights)
     value, _ = _reflect(scene, scene.slopes(height))
     weight = scene.trust
     return albedo * (weight * value).sum(1) / weight.sum(1).clamp(min=1e-9)
@@ -79,6 +79,19 @@ def test_exact_images_give_the_height_back():
     inside = torch.ones_like(albedo, dtype=torch.bool)
     inside[..., 0, -1] = inside[..., -1, 0] = False  # no triangle has its right angle in these corners
     torch.testing.assert_close(found.albedo[inside], albedo[inside], rtol=0, atol=1e-5)
+
+
+def test_two_images_are_enough_where_the_albedo_is_known():
+    """Also where no normal could be told from them; both lights see the pixel from different sides."""
+    y, x = torch.meshgrid(*(torch.arange(24, dtype=torch.float64),) * 2, indexing="ij")
+    height, albedo = (0.3 * x - 0.2 * y)[None, None], 0.5 + 0.3 * torch.rand(1, 1, 24, 24, generator=seeded(0)).double()
+    lights = LIGHTS[:2]
+    images = exact(height, albedo, lights)
+    start = height + 0.5 * torch.sin(x / 4) * torch.cos(y / 5)
+    found = refine(start, images, lights, albedo=albedo, n_iter=40, tol=0.0)
+    torch.testing.assert_close(found.height, height - height.mean() + start.mean(), rtol=0, atol=1e-5)
+    with pytest.raises(ValueError, match="at least K = 3"):
+        refine(start, images, lights)
 
 
 @pytest.mark.parametrize("name, seed", [("tent", 3), ("peaks", 4), ("gaussians", 5)])

@@ -61,12 +61,15 @@ class Samples(NamedTuple):
     batched: bool
 
 
-def check(name: str, images: Tensor, lights: Tensor, mask: Tensor | None, lit: Tensor | None) -> Samples:
-    """The arguments of a method as `Samples`; errors name the argument, what came and what is needed."""
+def check(
+    name: str, images: Tensor, lights: Tensor, mask: Tensor | None, lit: Tensor | None, least: int = 3
+) -> Samples:
+    """The arguments of a method as `Samples`, of at least so many lights; errors say what came and what is needed."""
     check_real(name, "images", images)
     shape = tuple(images.shape)
-    if images.ndim not in (3, 4) or shape[-3] < 3 or 0 in shape:
-        raise ValueError(f"{name}: images {shape} given, (N, K, H, W) or (K, H, W) of at least K = 3 lights is needed")
+    if images.ndim not in (3, 4) or shape[-3] < least or 0 in shape:
+        needed = f"(N, K, H, W) or (K, H, W) of at least K = {least} lights"
+        raise ValueError(f"{name}: images {shape} given, {needed} is needed")
     lights = check_lights(name, lights, images)
     for label, field, channels in (("mask", mask, 1), ("lit", lit, shape[-3])):
         if field is not None:

@@ -95,7 +95,7 @@ def refine(
 
     Args:
         height: (N, 1, H, W) or (1, H, W), where to start: what an integrator made of the normals.
-        images: (N, K, H, W) or (K, H, W), K at least 3.
+        images: (N, K, H, W) or (K, H, W), K at least 3, or 2 where the albedo is given.
         lights: (K, 3) or (N, K, 3), x right, y up, z to the viewer; their length is their strength.
         albedo: (N, 1, H, W), known brightness; None to find it.
         mask: (N, 1, H, W) bool, pixels of the object; what lies outside is never read, and stays as it was.
@@ -125,7 +125,7 @@ def refine(
         >>> bool(torchdls.rmse(better, surface.height) < torchdls.rmse(height, surface.height))
         True
     """
-    samples = check("refine", images, lights, mask, lit)
+    samples = check("refine", images, lights, mask, lit, least=3 if albedo is None else 2)
     check_fit("refine", "height", height, images, "images", channels=(1,), dtype=images.dtype)
     if albedo is not None:
         check_fit("refine", "albedo", albedo, images, "images", channels=(1,), dtype=images.dtype)
