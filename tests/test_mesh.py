@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.helpers.fields import random_field
-from torchdls import fit_mesh
+from torchdls import NormalViews, fit_mesh
 from torchdls.mesh import turn, turn_adjoint
 
 
@@ -51,6 +51,110 @@ def test_a_sphere_from_its_normals():
     torch.testing.assert_close(found.vertices.mean(0), start.mean(0))
     radius = (found.vertices - found.vertices.mean(0)).norm(dim=1)
     assert radius.std() < 0.02 * radius.mean()
+
+
+def ball(times=2):
+    """A sphere of equal triangles: an icosahedron, each face cut into four, so many times."""
+    g = (1 + 5**0.5) / 2
+    corners = [[-1, g, 0], [1, g, 0], [-1, -g, 0], [1, -g, 0], [0, -1, g], [0, 1, g], [0, -1, -g], [0, 1, -g]]
+    x = torch.tensor([*corners, [g, 0, -1], [g, 0, 1], [-g, 0, -1], [-g, 0, 1]], dtype=torch.float64)
+    faces = [(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6),
+             (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10),
+             (8, 6, 7), (9, 8, 1)]  # fmt: skip
+    points = [*torch.nn.functional.normalize(x, dim=1)]
+    for _ in range(times):
+        known: dict = {}
+
+        def middle(i, j, known=known):
+            key = min(i, j), max(i, j)
+            if key not in known:
+                known[key] = len(points)
+                points.append(torch.nn.functional.normalize(points[i] + points[j], dim=0))
+            return known[key]
+
+        cut = [(i, j, k, middle(i, j), middle(j, k), middle(k, i)) for i, j, k in faces]
+        faces = [f for i, j, k, a, b, c in cut for f in ((i, a, c), (j, b, a), (k, c, b), (a, b, c))]
+    return torch.stack(points), torch.tensor(faces)
+
+
+def six_views(n=48, distance=4.0, noise=0.0):
+    """Normal images of the unit sphere by cameras on the six half-axes: the ray meets it in closed form."""
+    eye = torch.eye(3, dtype=torch.float64)
+    K = torch.tensor([[1.6 * n, 0, (n - 1) / 2], [0, 1.6 * n, (n - 1) / 2], [0, 0, 1]], dtype=torch.float64)
+    rows, columns = torch.meshgrid(*(torch.arange(n, dtype=torch.float64),) * 2, indexing="ij")
+    ray = torch.stack([columns, rows, torch.ones_like(rows)], -1) @ torch.linalg.inv(K).T
+    ray = torch.nn.functional.normalize(ray, dim=-1)
+    images, poses = [], []
+    for i in range(6):
+        ahead = eye[i % 3] * (-1) ** (i // 3)
+        right = eye[(i + 1) % 3]
+        R = torch.stack([right, torch.linalg.cross(ahead, right), ahead])
+        centre = torch.tensor([0, 0, distance], dtype=torch.float64)  # of the sphere, before the camera
+        along = ray @ centre
+        under = along.square() - distance**2 + 1
+        normal = (along - under.clamp(min=0).sqrt())[..., None] * ray - centre
+        normal = torch.nn.functional.normalize(normal + noise * random_field(n, n, 3, seed=i), dim=-1)
+        flipped = normal * torch.tensor([1, -1, -1]) * (under > 0)[..., None]
+        images.append(flipped.movedim(-1, 0))
+        poses.append(torch.cat([R, centre[:, None]], 1))
+    return NormalViews(torch.stack(images), K, torch.stack(poses))
+
+
+def test_views_know_the_normals_of_a_sphere():
+    """Every point is seen by some camera; by one alone what faces it, and by none what is off the object."""
+    views, (x, faces) = six_views(), ball()
+    outward = torch.nn.functional.normalize(x[faces].mean(1), dim=1)
+    assert (views(outward, outward) - outward).norm(dim=1).max() < 5e-3
+    one = NormalViews(views.normals[:1], views.cameras, views.poses[:1])
+    to_camera = torch.nn.functional.normalize(torch.tensor([-4.0, 0, 0]).double() - outward, dim=1)
+    faced = (outward * to_camera).sum(1) > 0.3
+    assert torch.equal(one(outward, outward).any(1), faced)
+    assert 0.2 < faced.double().mean() < 0.5
+    assert not views(9 * outward, outward).any()
+
+
+@pytest.mark.parametrize("noise, bound", [(0.0, 0.08), (0.1, 0.14)])
+def test_a_sphere_from_its_normal_images(noise, bound):
+    """From an ellipsoid with noise, seen by six cameras: round, of about the size of the start, no face turned over."""
+    truth, faces = ball()
+    start = truth * torch.tensor([1.2, 0.9, 1.0], dtype=torch.float64) + 0.02 * random_field(*truth.shape, seed=1)
+    found = fit_mesh(start, faces, six_views(noise=noise), n_iter=8).vertices
+    rough, smooth = ((x - x.mean(0)).norm(dim=1) for x in (start, found))
+    assert smooth.std() / smooth.mean() < bound * rough.std() / rough.mean()
+    assert abs(smooth.mean() / rough.mean() - 1) < 0.1
+    assert ((face_normals(found, faces) * found[faces].mean(1)).sum(1) > 0).all()
+
+
+def test_faces_without_a_target_follow_those_that_have_one():
+    """A wave of which the normals are known on one half: the other half keeps its shape where the metric lets it."""
+    y, x = torch.meshgrid(*(torch.arange(9, dtype=torch.float64),) * 2, indexing="ij")
+    truth, faces = torch.stack([x, y, (x / 2).sin()], -1).flatten(0, 1), grid_faces(9)
+    target = face_normals(truth, faces)
+    known = truth[faces].mean(1)[:, 1] < 4
+    found = fit_mesh(truth * torch.tensor([1, 1, 0.0]).double(), faces, lambda c, n: target * known[:, None], n_iter=8)
+    error = (face_normals(found.vertices, faces) - target).norm(dim=1)
+    flat = (target - torch.tensor([0, 0, 1]).double()).norm(dim=1)
+    assert error[known].mean() < 1e-2
+    assert error[~known].mean() < flat[~known].mean()
+
+
+def test_what_is_no_field_of_normals_is_named():
+    x, faces = sphere(3, 4)
+    with pytest.raises(ValueError, match="tells no face"):
+        fit_mesh(x, faces, lambda c, n: 0 * n)
+    with pytest.raises(ValueError, match=r"normals\(\.\.\) \(1, 3\)"):
+        fit_mesh(x, faces, lambda c, n: n[:1])
+    with pytest.raises(TypeError, match=r"normals\(\.\.\)"):
+        fit_mesh(x, faces, lambda c, n: n.float())
+    images, eye, poses = torch.zeros(2, 3, 4, 4), torch.eye(3), torch.zeros(2, 3, 4)
+    for bad, match in (
+        ((images[:, :2], eye, poses), "normals"), ((images, eye[:2], poses), "cameras"),
+        ((images, eye, poses[0]), "poses"), ((images, eye, poses, 1.0), "facing=1.0"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=match):
+            NormalViews(*bad)
+    with pytest.raises(TypeError, match="cameras"):
+        NormalViews(images, eye.double(), poses)
 
 
 def test_an_open_wave_keeps_its_scale_and_place():

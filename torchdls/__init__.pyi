@@ -84,6 +84,7 @@ from .io import save_height as save_height
 from .io import save_mesh as save_mesh
 from .io import save_normals as save_normals
 from .mesh import MeshResult as MeshResult
+from .mesh import NormalViews as NormalViews
 from .mesh import fit_mesh as fit_mesh
 from .metrics import mean_absolute_depth_error as mean_absolute_depth_error
 from .metrics import mean_angular_error as mean_angular_error

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from torchdls._checks import check_alike, check_real, require
+from torchdls._checks import check_alike, check_real, check_together, require
 from torchdls._precision import full_precision
 from torchdls._tracing import is_concrete
 
@@ -17,7 +20,7 @@ class MeshResult(NamedTuple):
 
     Attributes:
         vertices: (V, 3).
-        energy: (iterations + 1,) 1/2 sum of area |n - target|^2 over the faces, from the start on.
+        energy: (iterations + 1,) 1/2 sum of area |n - target|^2 over the faces that have a target, from the start on.
         iterations: how many were made.
 
     Example:
@@ -32,11 +35,80 @@ class MeshResult(NamedTuple):
     iterations: int
 
 
+NormalField = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class NormalViews:
+    r"""Normals in space, as normal images of several cameras show them: what `fit_mesh` takes for `normals`.
+
+    A point c of a surface with normal n is seen by view v at the pixel K_v (R_v c + t_v); what the image holds there,
+    between its pixels by bilinear interpolation, is turned into the frame of the world. Views that see a point are
+    averaged by the cosine at which they look on n:
+
+        m(c, n) = normalised( \sum_v cos_v R_v^T S N_v(K_v (R_v c + t_v)) ),     S = diag(1, -1, -1)
+
+    over the views with cos_v above `facing` and known normals all around the pixel. That a point is hidden behind other
+    parts of the surface is not noticed.
+
+    Args:
+        normals: (V, 3, H, W), canonical in the axes of each camera (x right, y up, z to the viewer); 0 where unknown.
+        cameras: (V, 3, 3) or (3, 3), intrinsics K for pixels (column, row) from 0.
+        poses: (V, 3, 4), R and t from the world to each camera (x right, y down, z ahead).
+        facing: least cosine between the normal and the way to the viewer.
+
+    Raises:
+        TypeError: a tensor has the wrong type.
+        ValueError: shapes do not fit, or `facing` is not above 0 and below 1.
+
+    Example:
+        >>> images = torch.tensor([0.0, 0, 1]).view(1, 3, 1, 1).expand(1, 3, 9, 9)  # a wall, seen face-on
+        >>> camera, pose = torch.tensor([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), torch.eye(3, 4)[None]
+        >>> views = torchdls.NormalViews(images, camera, pose)
+        >>> views(torch.tensor([[0.1, 0.1, 2], [9, 0, 2]]), torch.tensor([[0.0, 0, -1], [0, 0, -1]]))
+        tensor([[ 0.,  0., -1.],
+                [ 0.,  0.,  0.]])
+    """
+
+    normals: Tensor
+    cameras: Tensor
+    poses: Tensor
+    facing: float = 0.3
+
+    def __post_init__(self) -> None:
+        name = "NormalViews"
+        check_together(name, normals=self.normals, cameras=self.cameras, poses=self.poses)
+        shape, k, p = (tuple(t.shape) for t in (self.normals, self.cameras, self.poses))
+        views = shape[:1]
+        fits = len(shape) == 4 and shape[1] == 3 and 0 not in shape and min(shape[2:]) > 1 and p == (*views, 3, 4)
+        fits = fits and k in {(3, 3), (*views, 3, 3)}
+        needed = "(V, 3, H, W), (V, 3, 3) or (3, 3), and (V, 3, 4) are needed"
+        require(fits, f"{name}: normals {shape}, cameras {k} and poses {p} given, {needed}")
+        require(0 < self.facing < 1, f"{name}: facing={self.facing!r} given, a number above 0 and below 1 is needed")
+
+    def __call__(self, centres: Tensor, normals: Tensor) -> Tensor:
+        """(F, 3) normals at points (F, 3) of a surface with normals (F, 3); 0 where no view sees it."""
+        R, t = self.poses[..., :3], self.poses[..., 3]
+        points = centres @ R.mT + t[:, None]  # (V, F, 3)
+        flip = points.new_tensor([1.0, -1.0, -1.0])
+        facing = -(F.normalize(points, dim=-1) * (normals @ R.mT)).sum(-1)
+        ahead = points[..., 2] > 0
+        pixel = points @ self.cameras.mT
+        pixel = pixel[..., :2] / torch.where(ahead, pixel[..., 2], 1)[..., None]
+        size = pixel.new_tensor([self.normals.shape[-1] - 1, self.normals.shape[-2] - 1])
+        known = (self.normals != 0).any(1, keepdim=True).to(points)
+        at = (2 * pixel / size - 1)[:, None]
+        seen = F.grid_sample(torch.cat([self.normals, known], 1), at, align_corners=True)[:, :, 0].mT  # (V, F, 4)
+        some = ahead & (facing > self.facing) & (seen[..., 3] > 1 - 1e-3)
+        turned = F.normalize(seen[..., :3] * flip, dim=-1) @ R
+        return F.normalize((torch.where(some, facing, 0)[..., None] * turned).sum(0), dim=-1)
+
+
 @full_precision
 def fit_mesh(
     vertices: Tensor,
     faces: Tensor,
-    normals: Tensor,
+    normals: Tensor | NormalField,
     *,
     n_iter: int = 30,
     tol: float = 1e-6,
@@ -45,6 +117,9 @@ def fit_mesh(
     r"""Move the vertices of a triangle mesh until its faces have the normals that are given.
 
         min over x   E(x) = 1/2 \sum_f a_f |n_f(x) - m_f|^2,     a_f the areas of the start
+
+    where m_f is one normal for each face, or that of a field of normals in space, m(c_f, n_f) at the centre c_f of the
+    face, such as normal images of calibrated cameras (`NormalViews`), which is read anew after every step,
 
     by the method of Gauss and Newton, damped in the metric of the cotangent Laplacian K (Levenberg, Marquardt):
 
@@ -64,7 +139,8 @@ def fit_mesh(
     Args:
         vertices: (V, 3), float32 or float64.
         faces: (F, 3) int64, counter-clockwise seen from outside.
-        normals: (F, 3), a target for each face, of any length but 0.
+        normals: (F, 3), a target for each face, of any length but 0; or a function of the centres (F, 3) and normals
+            (F, 3) of the faces that returns targets, 0 for faces that it tells nothing of. Those only follow smoothly.
         n_iter: limit of iterations.
         tol: stop once an iteration lowers E by less than `tol` of it, or E is below `tol`^2 times the area.
         max_iter: limit of conjugate-gradient steps in each iteration.
@@ -75,7 +151,7 @@ def fit_mesh(
     Raises:
         TypeError: a tensor has the wrong type.
         ValueError: shapes do not fit, a face names no vertex, a value is not finite, a normal is 0, a face has no
-            area, or an option is out of range.
+            area, an option is out of range, or a field of normals has no target for any face.
 
     Source: after Balzer, "A Gauss-Newton method for the integration of spatial normal fields in shape space", Journal
     of Mathematical Imaging and Vision 44, 2012 (not confirmed: there displacements are along the normal); cotangent
@@ -91,31 +167,47 @@ def fit_mesh(
         >>> bool(result.energy[-1] < 1e-6 * result.energy[0])
         True
     """
-    _check(vertices, faces, normals, n_iter, tol)
+    _check(vertices, faces, n_iter, tol)
+    if not callable(normals):
+        _check_targets(vertices, faces, normals)
     with torch.no_grad():
         x = vertices.detach().clone()
-        target = torch.nn.functional.normalize(normals.detach(), dim=1)
         areas = _vector_areas(x, faces).norm(dim=1)
-        energies, damping = [_energy(x, faces, target, areas)], 1e-1
+        target, trust = _targets(x, faces, normals, areas)
+        require(not is_concrete(x) or bool((trust > 0).any()), "fit_mesh: normals tells no face of a target")
+        energies, damping = [_energy(x, faces, target, trust)], 1e-1
         while len(energies) <= n_iter and float(energies[-1]) > tol**2 * float(areas.sum()):
-            d = _step(x, faces, target, areas, damping, max_iter)
+            d = _step(x, faces, target, trust, damping, max_iter)
             moved = x + d - d.mean(0)
-            lower = _energy(moved, faces, target, areas)
-            if not bool(lower < energies[-1]):
+            there, its_trust = _targets(moved, faces, normals, areas)
+            both = torch.minimum(trust, its_trust)  # faces that come into view, or leave it, are no gain and no loss
+            before, after = _energy(x, faces, target, both), _energy(moved, faces, there, both)
+            if not bool(after < before):
                 damping *= 10
                 if damping > 1e6:
                     break
                 continue
-            small = float(energies[-1] - lower) <= tol * float(energies[-1])
-            x, damping = moved, max(damping / 10, 1e-4)
-            energies.append(lower)
-            if small:
+            x, target, trust, damping = moved, there, its_trust, max(damping / 10, 1e-4)
+            energies.append(_energy(x, faces, target, trust))
+            if float(before - after) <= tol * float(before):
                 break
     return MeshResult(x, torch.stack(energies), len(energies) - 1)
 
 
+def _targets(x: Tensor, faces: Tensor, normals: Tensor | NormalField, areas: Tensor) -> tuple[Tensor, Tensor]:
+    """Targets (F, 3) of length 1 or 0, and how much each counts (F,)."""
+    if isinstance(normals, Tensor):
+        found = normals.detach()
+    else:
+        found = normals(x[faces].mean(1), normals_of(x, faces))
+        check_alike("fit_mesh", "normals(..)", found, x.dtype)
+        fits = found.shape == faces.shape and bool(found.isfinite().all())
+        require(fits, f"fit_mesh: normals(..) {tuple(found.shape)}, finite values {tuple(faces.shape)} are needed")
+    return F.normalize(found, dim=1), torch.where(found.any(1), areas, 0)
+
+
 def _step(x: Tensor, faces: Tensor, target: Tensor, areas: Tensor, damping: float, max_iter: int) -> Tensor:
-    """The displacement of one damped step of Gauss and Newton."""
+    """The displacement of one damped step of Gauss and Newton; `areas` are the weights of the faces."""
     edges, weights = cotangents(x, faces)
     diagonal = torch.zeros_like(x[:, 0]).index_add(0, edges.flatten(), weights.repeat_interleave(2))
 
@@ -131,7 +223,7 @@ def _step(x: Tensor, faces: Tensor, target: Tensor, areas: Tensor, damping: floa
 
 def normals_of(x: Tensor, faces: Tensor) -> Tensor:
     """(F, 3) normals of length 1."""
-    return torch.nn.functional.normalize(_vector_areas(x, faces), dim=1)
+    return F.normalize(_vector_areas(x, faces), dim=1)
 
 
 def turn(x: Tensor, faces: Tensor, d: Tensor) -> Tensor:
@@ -201,25 +293,30 @@ def _conjugate_gradients(apply, b: Tensor, diagonal: Tensor, max_iter: int) -> T
     return x
 
 
-def _check(vertices: Tensor, faces: Tensor, normals: Tensor, n_iter: int, tol: float) -> None:
+def _check(vertices: Tensor, faces: Tensor, n_iter: int, tol: float) -> None:
     name = "fit_mesh"
     check_real(name, "vertices", vertices)
     check_alike(name, "faces", faces, torch.int64)
-    check_alike(name, "normals", normals, vertices.dtype)
-    shapes = f"vertices {tuple(vertices.shape)}, faces {tuple(faces.shape)} and normals {tuple(normals.shape)} given"
-    fits = vertices.ndim == faces.ndim == normals.ndim == 2 and vertices.shape[1] == 3 and len(faces) > 0
-    fits = fits and faces.shape[1] == 3 and faces.shape == normals.shape
-    require(fits, f"{name}: {shapes}, (V, 3), (F, 3) and (F, 3) are needed")
+    shapes = f"vertices {tuple(vertices.shape)} and faces {tuple(faces.shape)} given"
+    fits = vertices.ndim == faces.ndim == 2 and vertices.shape[1] == 3 and len(faces) > 0 and faces.shape[1] == 3
+    require(fits, f"{name}: {shapes}, (V, 3) and (F, 3) are needed")
     require(isinstance(n_iter, int) and n_iter >= 0, f"{name}: n_iter={n_iter!r} given, at least 0 is needed")
     require(tol >= 0, f"{name}: tol={tol!r} given, at least 0 is needed")
     if not is_concrete(vertices):
         return
     inside = bool(((faces >= 0) & (faces < len(vertices))).all())
     require(inside, f"{name}: faces {tuple(faces.shape)} name vertices beyond 0 .. {len(vertices) - 1}")
-    for label, field in (("vertices", vertices), ("normals", normals)):
-        require(bool(field.isfinite().all()), f"{name}: {label} {tuple(field.shape)} is not finite")
-    require(bool((normals.norm(dim=1) > 0).all()), f"{name}: normals {tuple(normals.shape)} holds a normal of length 0")
+    require(bool(vertices.isfinite().all()), f"{name}: vertices {tuple(vertices.shape)} is not finite")
     require(
         bool((_vector_areas(vertices, faces).norm(dim=1) > 0).all()),
         f"{name}: faces {tuple(faces.shape)} holds a face without area",
     )
+
+
+def _check_targets(vertices: Tensor, faces: Tensor, normals: Tensor) -> None:
+    name, shape = "fit_mesh", tuple(normals.shape)
+    check_alike(name, "normals", normals, vertices.dtype)
+    require(normals.shape == faces.shape, f"{name}: normals {shape} given, {tuple(faces.shape)} as faces is needed")
+    if is_concrete(normals):
+        require(bool(normals.isfinite().all()), f"{name}: normals {shape} is not finite")
+        require(bool((normals.norm(dim=1) > 0).all()), f"{name}: normals {shape} holds a normal of length 0")

@@ -78,7 +78,8 @@ def heights(size: int, names: list[str]) -> list[list[Any]]:
     rows: list[list[Any]] = []
     for method in ("woodham", "dlpi", "dlnv"):
         for integrator in (LeastSquares(), SlopeDLS()):
-            found, polished = [], []
+            found: list[tuple[float, float]] = []
+            polished: list[tuple[float, float]] = []
             for i, name in enumerate(names):
                 surface = SURFACES[name](size)
                 images, _ = scenes(surface, TEN, 9300 + i)["noise, 10 lights"]

@@ -208,7 +208,7 @@ ELSEWHERE = {
     "lights_from_ball": "tests/photometric", "refine": "tests/photometric", "load_photographs": "tests/cli",
     "save_normals": "tests/cli", "denoise_height": "tests/dictionary", "denoise_normals": "tests/test_normal_coder.py",
     "slope_noise": "tests/test_slope_noise.py", "OnlineDLS": "tests/sequences", "SequenceDLS": "tests/sequences",
-    "SequencePatches": "tests/sequences", "fit_mesh": "tests/test_mesh.py",
+    "SequencePatches": "tests/sequences", "fit_mesh": "tests/test_mesh.py", "NormalViews": "tests/test_mesh.py",
     "normal_noise": "tests/test_normal_coder.py", "integrate_many": "tests/batch", "reconstruct": "normals_to_gradient",
     "integrate_scattered": "tests/integrators/classic", "shrink_slow_waves": "tests/integrators/slope_dls",
     "fit_coarse": "tests/test_anchors.py", "place_pieces": "tests/test_anchors.py",
