@@ -314,8 +314,9 @@ def _check(vertices: Tensor, faces: Tensor, n_iter: int, tol: float) -> None:
 
 
 def _check_targets(vertices: Tensor, faces: Tensor, normals: Tensor) -> None:
-    name, shape = "fit_mesh", tuple(normals.shape)
+    name = "fit_mesh"
     check_alike(name, "normals", normals, vertices.dtype)
+    shape = tuple(normals.shape)
     require(normals.shape == faces.shape, f"{name}: normals {shape} given, {tuple(faces.shape)} as faces is needed")
     if is_concrete(normals):
         require(bool(normals.isfinite().all()), f"{name}: normals {shape} is not finite")

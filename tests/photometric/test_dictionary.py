@@ -57,7 +57,7 @@ def test_the_map_step_is_the_dense_solve(monkeypatch):
     lit = torch.rand(images.shape, generator=seeded(2)) < 0.8
     seen = {}
 
-    def spy(x, update, patches, mu, n_iter):
+    def spy(x, update, patches, depth, mu, n_iter):
         seen["folded"] = random_field(*x.shape, seed=5)
         return update(seen["folded"])
 
@@ -90,11 +90,26 @@ def test_the_objective_falls(monkeypatch):
         def update(folded, c=c):
             return (images + 2 * lam * folded) / (1 + c)
 
-        X = dictionary._denoise(images, update, patches, images.new_full((1,), mu), n_iter)
+        X = dictionary._denoise(
+            images, update, patches, dictionary._matte(LIGHTS[None]), images.new_full((1,), mu), n_iter
+        )
         R = dictionary._extract(X, patches) - parts["D"] @ parts["B"]
         cost = 0.5 * (images - X).square().sum() + lam * (R.square().sum() + mu**2 * (parts["B"] != 0).sum())
         costs.append(float(cost))
     assert all(b <= a + 1e-9 for a, b in pairwise(costs))
+
+
+def test_the_order_of_the_images_does_not_matter():
+    """And many images help: the first atoms span what matte images can be, whatever the lights."""
+    lights = torch.cat([ring_of_lights(8, tilt, dtype=torch.float64) for tilt in (25.0, 45.0)])
+    normals = gradient_to_normals(SURFACES["gaussians"](32, dtype=torch.float64).gradient)
+    exact = render(normals, lights)
+    assert degrees(dlpi_normals(exact, lights).normals, normals) < 0.05
+    noisy = render(normals, lights, snr_db=15, generator=seeded(2))
+    order = torch.randperm(16, generator=seeded(3))
+    found, other = (dlpi_normals(i, k).normals for i, k in ((noisy, lights), (noisy[:, order], lights[order])))
+    torch.testing.assert_close(other, found, rtol=0, atol=1e-8)
+    assert degrees(found, normals) < 0.6 * degrees(woodham(noisy, lights, shadow=None).normals, normals)
 
 
 def test_patches_of_channels_are_adjoint():
@@ -121,6 +136,16 @@ def test_masks_batches_and_derivatives(method):
     point = images.clone().requires_grad_()
     method(point, LIGHTS, n_iter=2).normals.square().mean().backward()
     assert point.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_derivatives_by_finite_differences(method):
+    """In the images and in the lights, with some codes kept and some not."""
+    images = torch.rand(1, 4, 5, 6, dtype=torch.float64, generator=seeded(3)) + 0.3
+    lights = LIGHTS[::2] + 0.1 * random_field(4, 3, seed=4)
+    options = {"patch_size": 3, "stride": 2, "mu": 0.1, "n_iter": 2}
+    inputs = images.requires_grad_(), lights.requires_grad_()
+    assert torch.autograd.gradcheck(lambda i, k: torch.cat(method(i, k, **options)[:2], 1), inputs, fast_mode=True)
 
 
 @pytest.mark.parametrize("method", METHODS)

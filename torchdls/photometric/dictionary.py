@@ -42,9 +42,11 @@ def dlpi_normals(
 
         min over X, D, B   1/2 ||Y - X||^2 + lam ( \sum_j ||P_j X - D b_j||^2 + mu^2 ||B||_0 )
 
-    over patches of patch_size x patch_size pixels and all K images, then `woodham` on X. Each iteration is one sweep of
-    SOUP-DIL (`torchdls.SoupDIL`) and the exact X = (Y + 2 lam fold(D B)) / (1 + 2 lam c), c patches holding a pixel.
-    Pixels outside the mask, and samples that are not lit, take the value of the patches. Differentiable (unrolled).
+    over patches of patch_size x patch_size pixels and all K images, then `woodham` on X. The first atoms are cosines
+    over the pixels times an orthonormal basis of the span of the lights, since matte images are combinations of those.
+    Each iteration is one sweep of SOUP-DIL (`torchdls.SoupDIL`) and the exact
+    X = (Y + 2 lam fold(D B)) / (1 + 2 lam c), c patches holding a pixel. Pixels outside the mask, and samples that are
+    not lit, take the value of the patches. Differentiable (unrolled).
 
     Args:
         images: (N, K, H, W) or (K, H, W), one per light.
@@ -89,7 +91,7 @@ def dlpi_normals(
         return (trust * Y + 2 * lam * folded) / torch.where(total > 0, total, 1)
 
     start = _filled(Y, live)
-    X = _denoise(start, update, patches, level, n_iter)
+    X = _denoise(start, update, patches, _matte(samples.lights), level, n_iter)
     inside = live if shadow is None else lit_samples("dlpi_normals", Y, live, shadow)
     clean = samples._replace(images=X if live is None else torch.where(live, X, 0), lit=inside)
     b, _ = fit(clean.images, clean.lights, None if inside is None else inside.to(X.dtype))
@@ -171,7 +173,7 @@ def dlnv_normals(
 
     plain, _ = fit(Y, lights, trust)
     known = (plain != 0).any(1, keepdim=True)
-    N = _denoise(_filled(plain, known.expand_as(plain)), update, patches, level, n_iter)
+    N = _denoise(_filled(plain, known.expand_as(plain)), update, patches, eye[None], level, n_iter)
     return result(torch.where(known, N, 0), samples)
 
 
@@ -192,10 +194,15 @@ def _checked(
     return samples, patches
 
 
-def _denoise(x: Tensor, update: Callable[[Tensor], Tensor], patches: Patches, mu: Tensor, n_iter: int) -> Tensor:
-    """x (N, C, H, W) after iterations of a sweep over its patches of all channels, and of `update`(fold(D B))."""
-    channels = x.shape[1]
-    D = _cosines(patches, channels).to(x)[None].expand(len(x), -1, -1)
+def _denoise(
+    x: Tensor, update: Callable[[Tensor], Tensor], patches: Patches, depth: Tensor, mu: Tensor, n_iter: int
+) -> Tensor:
+    """x (N, C, H, W) after iterations of a sweep over its patches of all channels, and of `update`(fold(D B)).
+
+    The first atoms are cosines over the pixels times the columns of `depth` (N, C, M) over the channels.
+    """
+    space = dct_dictionary(patches.size).to(x)
+    D = torch.einsum("zcd,nk->zcndk", depth, space).flatten(3).flatten(1, 2).expand(len(x), -1, -1)
     B = x.new_zeros(len(x), D.shape[-1], _extract(x, patches).shape[-1])
     for _ in range(n_iter):
         P = _extract(x, patches)
@@ -204,10 +211,9 @@ def _denoise(x: Tensor, update: Callable[[Tensor], Tensor], patches: Patches, mu
     return x
 
 
-def _cosines(patches: Patches, channels: int) -> Tensor:
-    """Orthonormal atoms over pixels and channels, three for each of the pixels': matte images are of rank three."""
-    space, depth = dct_dictionary(patches.size), dct_dictionary((channels, 1))[:, :3]
-    return torch.einsum("cd,nk->cndk", depth, space).reshape(channels * patches.n_pixels, -1)
+def _matte(lights: Tensor) -> Tensor:
+    """(N, K, 3) an orthonormal basis of what matte images can be at a pixel: the span of the lights (N, K, 3)."""
+    return torch.linalg.qr(lights).Q
 
 
 def _extract(x: Tensor, patches: Patches) -> Tensor:
