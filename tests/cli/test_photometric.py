@@ -18,6 +18,8 @@ from torchdls import (
     ring_of_lights,
     rmse,
     save_normals,
+    slope_noise,
+    woodham,
 )
 from torchdls.cli.main import main
 
@@ -52,6 +54,21 @@ def test_a_folder_becomes_a_surface_and_a_normal_map(folder, tmp_path, capsys):
     expected = gradient_to_normals(surface.gradient)
     assert (field.values.double() - expected)[..., 2:-2, 2:-2].abs().mean() < 0.01
     assert main([str(a) for a in [*arguments, "--force", "--refine", "--method", "dlnv", "--quiet"]]) == 0
+
+
+def test_files_hold_albedo_confidence_and_the_noise_of_the_normals(folder, tmp_path):
+    """Those of the method itself, and enough to weigh slopes by their own noise."""
+    out, normals = tmp_path / "z.npz", tmp_path / "n.npz"
+    arguments = ["photometric", folder, "-o", out, "--normals", normals, "--quiet", "--integrator", "least_squares"]
+    assert main([str(a) for a in arguments]) == 0
+    found = woodham(load_photographs(folder).images, LIGHTS.float())
+    for path in (out, normals):
+        with np.load(path) as held:
+            for name in ("albedo", "confidence", "covariance"):
+                np.testing.assert_allclose(held[name], getattr(found, name)[0].squeeze(0).numpy(), rtol=1e-5)
+            values = torch.from_numpy(held["normals"])[None]
+            weight = slope_noise(values, torch.from_numpy(held["covariance"])[None]).weight
+            assert (weight > 0).all()
 
 
 def test_lights_may_come_from_a_ball_and_intensities_from_a_file(folder, tmp_path):

@@ -65,6 +65,18 @@ def test_bernstein_polynomials_and_their_bends_by_hand():
     torch.testing.assert_close(full @ _roughness(3) @ full, bends)
 
 
+def test_derivatives():
+    """In images and lights, by finite differences; no bound of the fit may come in or go out on the way."""
+    lights = LIGHTS[::4]
+    images = (render(normals(), lights) ** 0.8)[..., 3:5, 6:7]
+
+    def run(i, k):
+        return torch.cat(bivariate_normals(i, k, degree=2, n_iter=40)[:2], 1)
+
+    inputs = images.requires_grad_(), lights.clone().requires_grad_()
+    assert torch.autograd.gradcheck(run, inputs, fast_mode=True, atol=1e-5)
+
+
 def test_pixels_with_fewer_than_three_lit_samples_are_unknown():
     images = render(normals(), LIGHTS)
     images[:, 2:, 0, 0] = 0

@@ -31,7 +31,11 @@ def add_photometric(commands: Any) -> None:
     add = command.add_argument
     add("folder", metavar="FOLDER", help="the folder with the pictures")
     add("-o", "--out", action="append", default=[], metavar="OUT", help=f"the surface: {OUTPUTS}")
-    add("--normals", metavar="OUT", help="the normal map: PNG (16-bit), NPY or NPZ")
+    add(
+        "--normals",
+        metavar="OUT",
+        help="the normal map: PNG (16-bit), NPY or NPZ (with albedo, confidence and covariance)",
+    )
     add("--method", default=_METHOD, help=f"{', '.join(PHOTOMETRIC)} (default: {_METHOD})")
     add("--integrator", default=_INTEGRATOR, help=f"{', '.join(INTEGRATORS)} (default: {_INTEGRATOR})")
     add("--set", action="append", default=[], metavar="NAME=VALUE", help="option of the integrator, such as lam=0.5")
@@ -70,7 +74,7 @@ def _photometric(arguments: argparse.Namespace) -> None:
         if not bool((found.normals != 0).any()):
             raise ValueError(f"{arguments.folder}: no pixel has a normal; three lights must reach it")
         if arguments.normals is not None:
-            io.save_normals(arguments.normals, found.normals, mask=mask, overwrite=arguments.force)
+            io.save_normals(arguments.normals, found.normals, mask=mask, overwrite=arguments.force, **_said(found))
         if arguments.out:
             _surface(arguments, images, lights, mask, found)
     if not arguments.quiet:
@@ -101,6 +105,11 @@ def _object(photographs: Photographs) -> Tensor | None:
     return ~ball if mask is None else mask & ~ball
 
 
+def _said(found: Any) -> dict[str, Tensor]:
+    """What NPZ files hold beside the normals: albedo and confidence (H, W), covariance (6, H, W)."""
+    return {"albedo": found.albedo[0, 0], "confidence": found.confidence[0, 0], "covariance": found.covariance[0]}
+
+
 def _surface(arguments: argparse.Namespace, images: Tensor, lights: Tensor, mask: Tensor | None, found: Any) -> None:
     from torchdls import io
     from torchdls.geometry import normals_to_gradient
@@ -124,6 +133,6 @@ def _surface(arguments: argparse.Namespace, images: Tensor, lights: Tensor, mask
         else:
             io.save_height(
                 path, height, mask=inside, pixel_size=size, overwrite=arguments.force,
-                normals=found.normals[0], albedo=found.albedo[0, 0], gradient=field.gradient[0],
+                normals=found.normals[0], gradient=field.gradient[0], **_said(found),
                 **{name: maps[name][0] for name in maps},
             )  # fmt: skip

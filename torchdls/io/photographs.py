@@ -100,6 +100,7 @@ def save_normals(
     mask: Tensor | None = None,
     convention: str = "opengl",
     overwrite: bool = False,
+    **arrays: Tensor,
 ) -> None:
     """Write a normal map: PNG of 16 bits (code = (n + 1)/2, alpha 0 outside the mask), NPY (3, H, W) or NPZ.
 
@@ -109,6 +110,7 @@ def save_normals(
         mask: bool, (1, 1, H, W), (1, H, W) or (H, W); default: where the normal is not 0.
         convention: how the file has it, in the conventions of normals.
         overwrite: replace an existing file.
+        **arrays: more entries of an NPZ file, such as albedo and covariance; other formats leave them out.
 
     Raises:
         TypeError: the normals are no floats, or the mask is not bool.
@@ -147,7 +149,8 @@ def save_normals(
     elif path.suffix.lower() == ".npy":
         write = lambda file: np.save(file, values)  # noqa: E731
     else:
-        write = lambda file: np.savez_compressed(file, allow_pickle=False, normals=values, mask=valid)  # noqa: E731
+        entries = {"normals": values, "mask": valid} | {k: v.detach().cpu().numpy() for k, v in arrays.items()}
+        write = lambda file: np.savez_compressed(file, allow_pickle=False, **entries)  # noqa: E731
     with atomic_file(path, overwrite) as file:
         write(file)
 
