@@ -105,7 +105,7 @@ def _object(photographs: Photographs) -> Tensor | None:
     return ~ball if mask is None else mask & ~ball
 
 
-def _said(found: Any) -> dict[str, Tensor]:
+def _said(found: Any) -> dict[str, Any]:
     """What NPZ files hold beside the normals: albedo and confidence (H, W), covariance (6, H, W)."""
     return {"albedo": found.albedo[0, 0], "confidence": found.confidence[0, 0], "covariance": found.covariance[0]}
 
