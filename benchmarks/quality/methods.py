@@ -1,9 +1,9 @@
 """One row per method: `python -m benchmarks.quality.methods` (add --smoke for a smoke run).
 
 Every integrator with its defaults, and those forms of some that are not, on a smooth surface, a creased one, one that
-jumps, and the smooth one with outliers: RMSE in pixels and seconds of a core, means over fresh noise. Slopes of 20 dB; the jump is a lower half that rises from the upper
-one, tied to it at the left; outliers are 2 % of the samples, off by 20 times the root mean square slope. Writes JSON
-and a table.
+jumps, and the smooth one with outliers: RMSE in pixels and seconds of a core, means over fresh noise. Slopes of 20 dB;
+the jump is a lower half that rises from the upper one, tied to it at the left; outliers are 2 % of the samples, off by
+20 times the root mean square slope. Writes JSON and a table.
 """
 
 from __future__ import annotations
