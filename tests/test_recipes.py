@@ -11,10 +11,12 @@ import torchdls
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "recipes"
 RECIPES = sorted(path for path in FOLDER.glob("*.md") if path.name != "index.md")
+SLOW = {"deepinv": pytest.mark.slow, "lightning": pytest.mark.slow}  # whose packages take seconds to import
 
 
 @pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # rasterio with affine 3
-@pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
+@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning", "ignore:.*does not have many workers")  # Lightning
+@pytest.mark.parametrize("path", [pytest.param(p, marks=SLOW.get(p.stem, ()), id=p.stem) for p in RECIPES])
 def test_a_recipe_runs(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     for package in re.findall(r"^<!-- needs: (\w+) -->$", text, re.MULTILINE):
