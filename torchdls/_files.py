@@ -41,10 +41,11 @@ def check_output(
     path = Path(path)
     if suffixes is not None and path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: unknown format {path.suffix!r}, choose from {', '.join(suffixes)}")
-    parent = Path(os.path.realpath(path)).parent if path.is_symlink() and overwrite else path.parent
-    if not parent.is_dir():
+    name = os.fspath(path)  # strings: paths made and parted cost more than what is asked of the system
+    parent = os.path.dirname(os.path.realpath(name) if overwrite and os.path.islink(name) else name) or "."
+    if not os.path.isdir(parent):
         raise FileNotFoundError(f"{path}: the directory {parent} does not exist")
-    if path.is_dir() or (os.path.lexists(path) and not overwrite):
+    if os.path.lexists(name) and (not overwrite or os.path.isdir(name)):
         raise FileExistsError(f"{path}: exists already; only --force (overwrite=True) replaces a file")
     return path
 
@@ -94,12 +95,12 @@ def _draft(place: Path) -> BinaryIO:
 
     Each place has one name for its draft, and only a writer that finds it taken lists the folder to look for the dead.
     """
-    tries = 0
+    tries, folder = 0, os.path.dirname(place)
     while True:
         name = "0" * 8 if tries < 2 else secrets.token_hex(4)
         tries += 1
         try:
-            file = open(place.with_name(f".{place.name}.{name}.draft"), "xb")  # noqa: SIM115 (the caller closes it)
+            file = open(os.path.join(folder, f".{place.name}.{name}.draft"), "xb")  # noqa: SIM115 (the caller closes it)
         except FileExistsError:
             _sweep(place)
             continue

@@ -49,6 +49,7 @@ def test_what_was_done_meanwhile_is_not_taken(tmp_path):
 
 def test_a_failure_is_not_tried_again_by_those_who_run(tmp_path):
     with Claims(tmp_path) as a, Claims(tmp_path) as b:
+        time.sleep(0.02)  # files are stamped by the ticks of the system's clock
         assert a.take("x", never)
         a.fail("x")
         assert not b.take("x", never)
@@ -116,24 +117,13 @@ def test_many_threads_take_everything_once(tmp_path):
 
 
 def test_a_claim_that_cannot_be_signed_is_none(tmp_path, monkeypatch):
-    class Full:
-        """A file on a full disk: it is made, but holds nothing."""
+    """On a full disk a file is made, but holds nothing."""
 
-        def __init__(self, path, mode):
-            self.name = str(path)
-            open(path, mode).close()
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            return None
-
-        def write(self, text):
-            raise OSError(28, "No space left on device")
+    def full(file, text):
+        raise OSError(28, "No space left on device")
 
     with Claims(tmp_path) as claims:
-        monkeypatch.setattr("torchdls.batch.claims.open", Full, raising=False)
+        monkeypatch.setattr("torchdls.batch.claims.os.write", full)
         with pytest.raises(OSError, match=rf"No space left on device: '{tmp_path}.*claims") as caught:
             claims.take("a", lambda: False)
         assert not list((tmp_path / "claims").iterdir())

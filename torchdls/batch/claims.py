@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TextIO
+from typing import Self
 
 try:
     import fcntl
@@ -79,14 +79,14 @@ class Claims:
         if self._failed_since(key):
             return False
         for generation in range(1 << 20):
-            place = self._claims / f"{key}.{generation}"
+            place = os.path.join(self._claims, f"{key}.{generation}")
             try:
-                file = open(place, "x")  # noqa: SIM115 (`_sign` closes it)
+                file = os.open(place, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
             except FileExistsError:
-                if self._lives(place):
+                if self._lives(Path(place)):
                     return False
                 continue
-            self._sign(file)
+            self._sign(file, place)
             self._held[name] = generation
             if done() or self._failed_since(key):  # by someone who let go between our look and our claim
                 self.release(name)
@@ -94,22 +94,24 @@ class Claims:
             return True
         return False
 
-    def _sign(self, file: TextIO) -> None:
+    def _sign(self, file: int, place: str) -> None:
         """The owner's name into a claim just made; if it cannot be written, as on a full disk, nothing is claimed."""
         try:
-            with file:
-                file.write(self._id)
+            try:
+                os.write(file, self._id.encode())  # so short that it is written whole or not at all
+            finally:
+                os.close(file)
         except OSError as error:
             with suppress(OSError):
-                os.unlink(file.name)
-            raise OSError(error.errno, error.strerror, file.name) from error
+                os.unlink(place)
+            raise OSError(error.errno, error.strerror, place) from error
 
     def release(self, name: str) -> None:
         """Let go of a map that is done, or will not be."""
         key = _key(name)
         for generation in range(self._held.pop(name, -1) + 1):
             with suppress(OSError):
-                (self._claims / f"{key}.{generation}").unlink()
+                os.unlink(os.path.join(self._claims, f"{key}.{generation}"))
 
     def fail(self, name: str) -> None:
         """Let go of a map that cannot be done; no process that runs now tries it again."""
@@ -120,7 +122,7 @@ class Claims:
     def succeed(self, name: str) -> None:
         """Let go of a map whose results are in their places."""
         with suppress(OSError):
-            (self._failed / _key(name)).unlink(missing_ok=True)
+            os.unlink(os.path.join(self._failed, _key(name)))
         self.release(name)
 
     def has_failed(self, name: str) -> bool:
@@ -129,7 +131,7 @@ class Claims:
 
     def _failed_since(self, key: str) -> bool:
         try:
-            return (self._failed / key).stat().st_mtime > self._began
+            return os.stat(os.path.join(self._failed, key)).st_mtime > self._began
         except OSError:
             return False
 

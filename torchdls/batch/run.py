@@ -23,6 +23,7 @@ from torchdls.batch.claims import Claims
 from torchdls.batch.lots import BYTES_AT_REST, in_lots
 from torchdls.batch.many import Integrated, Member, Trusted, lot_key, together
 from torchdls.batch.maps import Manner, Map, read_map, write_map
+from torchdls.batch.plain import read_plain
 from torchdls.batch.plan import Job
 from torchdls.batch.report import DONE, FAILED, KEPT, Progress, Report
 from torchdls.batch.stores import exists, fetched, placed
@@ -81,7 +82,9 @@ class _Files(Dataset[list[Any]]):
         self.jobs, self.manner = jobs, manner
 
     def __getitem__(self, indices: list[int]) -> list[Any]:
-        return [_Read(*map(_as_array, self._read(index))) for index in indices]
+        plain = read_plain([self.jobs[index].source for index in indices], self.manner)
+        read = (self._read(i) if of is None else _Read(i, of) for i, of in zip(indices, plain, strict=True))
+        return [_Read(*map(_as_array, part)) for part in read]
 
     def _read(self, index: int) -> _Read:
         try:
@@ -199,7 +202,8 @@ class Run:
             maps = self._read(chain([first], drawn))
             try:
                 for lot in in_lots(maps, self._kind, _pixels, self.setting.memory):
-                    writing.extend(self._integrate(lot, writer))
+                    done, threads = self._integrate(lot), self._threads(lot)
+                    writing.append((len(lot) * _pixels(lot[0]), writer.submit(self._write_all, done, threads)))
                     self._finish(writing, self.setting.memory // 4)
                 self._finish(writing, 0)
             except BaseException:
@@ -245,20 +249,26 @@ class Run:
         key = lot_key(Member(0, of.gradient, of.mask, of.weight), self._method(of))
         return None if key is None else (key, *_seen(of))
 
-    def _integrate(self, lot: Sequence[_Read], writer: ThreadPoolExecutor) -> Iterator[tuple[int, Future[None]]]:
-        """Sends the results of a lot to be written."""
+    def _integrate(self, lot: Sequence[_Read]) -> list[tuple[Integrated, Map]]:
+        """The results of a lot, ready to be written."""
         maps = {read.number: _content(read) for read in lot}
-        first = _content(lot[0])
-        method = self._method(first)
-        threads = self.setting.threads if _pixels(lot[0]) >= LARGE else 1
-        self.setting.use_threads(threads)
+        self.setting.use_threads(self._threads(lot))
         members = [Member(i, of.gradient, of.mask, of.weight) for i, of in maps.items()]
-        for result, _ in together(members, method, self._kind(lot[0]), self._trusted):
+        found: list[tuple[Integrated, Map]] = []
+        for result, _ in together(members, self._method(_content(lot[0])), self._kind(lot[0]), self._trusted):
             if result.height is None:
                 self._fail(result.number, f"{self.jobs[result.number].source.path}: {result.error}")
             else:
-                of = maps[result.number]
-                yield _pixels(lot[0]), writer.submit(self._write, result, of, threads)
+                found.append((result, maps[result.number]))
+        return found
+
+    def _threads(self, lot: Sequence[_Read]) -> int:
+        return self.setting.threads if _pixels(lot[0]) >= LARGE else 1
+
+    def _write_all(self, done: Sequence[tuple[Integrated, Map]], threads: int) -> None:
+        """Handed to the writer as one piece of work: to hand over each map costs as much as half of its writing."""
+        for result, of in done:
+            self._write(result, of, threads)
 
     def _write(self, result: Integrated, of: Map, threads: int) -> None:
         job = self.jobs[result.number]

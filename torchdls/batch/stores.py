@@ -100,7 +100,9 @@ def _fetch(path: str, folder: str) -> str:
 def placed(output: str) -> Iterator[str]:
     """A path on this machine for a result; when the block ends without an error, it is in its place."""
     if not is_url(output):
-        os.makedirs(os.path.dirname(output) or ".", exist_ok=True)
+        folder = os.path.dirname(output) or "."
+        if not os.path.isdir(folder):
+            os.makedirs(folder, exist_ok=True)
         yield output
         return
     store, place = _store(output)

@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from torchdls._checks import check_field, check_fit, check_real
 from torchdls._precision import full_precision
 from torchdls.geometry.cameras import apply_matrix, check_camera, inverse_camera, pixel_grid
-from torchdls.geometry.conventions import NORMAL_CONVENTIONS, inverse_axes, lookup, permute
+from torchdls.geometry.conventions import NORMAL_CONVENTIONS, Axes, inverse_axes, lookup, permute
 from torchdls.operators import as_pixel_size
 
 
@@ -283,30 +283,76 @@ def guess_convention(
         'directx'
     """
     check_field("guess_convention", "normals", normals, 3)
-    curl, scale, known = {}, 0.0, dict[Hashable, tuple[int, Tensor, Tensor, bool]]()
+    total, terms = {}, 0.0
+    known, sums = dict[Hashable, tuple[Axes, _Cells]](), dict[Hashable, tuple[float, float]]()
     for name in candidates:
         axes = lookup(NORMAL_CONVENTIONS, "convention", name)
-        hand = axes[0][1] * axes[1][1]  # readings that differ by signs of x and y alone differ by that of one term
-        frame = name if camera is not None else (axes[0][0], axes[1][0], axes[2])
+        frame = name if camera is not None else axes[2]
         if frame not in known:
-            known[frame] = hand, *_twists(normals_to_gradient(normals.detach(), name, mask=mask, camera=camera))
-        first, a, b, some = known[frame]
-        # A plane is a surface in every reading; a reading without any cell is none.
-        curl[name] = float((a - b if hand == first else a + b).abs().sum()) if some else float("inf")
-        scale = max(scale, float((a.abs() + b.abs()).sum()))
-    residual = {name: value / (scale or 1.0) for name, value in curl.items()}
+            known[frame] = axes, _cells(normals_to_gradient(normals.detach(), name, mask=mask, camera=camera))
+        own, cells = known[frame]
+        reading = _reading(own, axes)
+        if (frame, reading) not in sums:
+            curl, scale = _curl(cells, *reading)
+            sums[frame, reading] = float(curl.sum()), float(scale.sum())
+        total[name], terms = sums[frame, reading][0], max(terms, sums[frame, reading][1])
+    residual = {name: value / (terms or 1.0) for name, value in total.items()}
     if not residual or min(residual.values()) == float("inf"):
         raise ValueError(f"normals: no 2x2 cell of valid pixels in any of the conventions {', '.join(candidates)}")
     return ConventionGuess(min(residual, key=residual.__getitem__), residual)
 
 
-def _twists(field: GradientField) -> tuple[Tensor, Tensor, bool]:
-    """D_x g_y and D_y g_x on the complete 2x2 cells, and whether there are any."""
+def convention_residuals(field: GradientField, convention: str, candidates: Sequence[str]) -> dict[str, Tensor]:
+    """The residuals of `guess_convention` for each surface (N,) by itself, from its slopes under one convention.
+
+    Args:
+        field: slopes (N, 2, H, W) without a camera.
+        convention: under which they were found.
+        candidates: conventions with the same z.
+    """
+    own, cells = lookup(NORMAL_CONVENTIONS, "convention", convention), _cells(field)
+    readings = {name: _reading(own, lookup(NORMAL_CONVENTIONS, "convention", name)) for name in candidates}
+    sums = {reading: _curl(cells, *reading) for reading in set(readings.values())}
+    terms = torch.stack([scale for _, scale in sums.values()]).amax(0)
+    return {name: sums[reading][0] / torch.where(terms > 0, terms, 1) for name, reading in readings.items()}
+
+
+class _Cells(NamedTuple):
+    """Differences along x and y of both slopes (N, 2, H - 1, W - 1) on the complete 2x2 cells; are there any?"""
+
+    x: Tensor
+    y: Tensor
+    some: bool
+
+
+def _cells(field: GradientField) -> _Cells:
+    g = field.gradient
+    down, across = (g[..., 1:, :] + g[..., :-1, :]) / 2, (g[..., 1:] + g[..., :-1]) / 2
+    x, y = down.diff(dim=-1), across.diff(dim=-2)
+    if field.mask.all():
+        return _Cells(x, y, x.numel() > 0)
     pairs = field.mask[..., 1:] & field.mask[..., :-1]
     cells = pairs[..., 1:, :] & pairs[..., :-1, :]
-    gx, gy = field.gradient.split(1, -3)
-    slope_y, slope_x = (gy[..., 1:, :] + gy[..., :-1, :]) / 2, (gx[..., 1:] + gx[..., :-1]) / 2
-    return slope_y.diff(dim=-1) * cells, slope_x.diff(dim=-2) * cells, bool(cells.any())
+    return _Cells(x * cells, y * cells, bool(cells.any()))
+
+
+def _reading(own: Axes, other: Axes) -> tuple[bool, bool]:
+    """How slopes found under `own` read under `other`, with the same z: exchanged or not, with equal signs or not.
+
+    Without a camera they are each other's, but for places and signs; the curl asks for the product of the signs alone.
+    """
+    exchanged = own[0][0] != other[0][0]
+    first = own[1] if exchanged else own[0]
+    second = own[0] if exchanged else own[1]
+    return exchanged, other[0][1] * first[1] != other[1][1] * second[1]
+
+
+def _curl(cells: _Cells, exchanged: bool, opposed: bool) -> tuple[Tensor, Tensor]:
+    """The sums (N,) of the curl and of its two terms; infinite curl where there is no cell."""
+    a, b = cells.x[..., 0 if exchanged else 1, :, :], cells.y[..., 1 if exchanged else 0, :, :]
+    curl = (a + b if opposed else a - b).abs().sum((-2, -1))
+    # A plane is a surface in every reading; a reading without any cell is none.
+    return curl if cells.some else torch.full_like(curl, torch.inf), (a.abs() + b.abs()).sum((-2, -1))
 
 
 def _length(a: Tensor, b: Tensor, c: Tensor) -> Tensor:

@@ -27,6 +27,7 @@ from torchdls._files import (
     single_map,
 )
 from torchdls.geometry import height_to_points
+from torchdls.io.containers import write_npz
 from torchdls.io.formats import read_file, silent
 from torchdls.io.meshes import MESH_SUFFIXES, save_mesh
 
@@ -112,21 +113,23 @@ def save_height(
     if mask is not None:
         check_alike("save_height", "mask", mask, torch.bool)
     values = single_map("height", height)
-    valid = np.isfinite(values) if mask is None else single_map("mask", mask).astype(bool)
-    if valid.shape != values.shape:
-        raise ValueError(f"mask: shape {tuple(valid.shape)} given beside a height {tuple(values.shape)}")
-    valid = valid & np.isfinite(values)
+    valid = np.isfinite(values)
+    if mask is not None:
+        inside = single_map("mask", mask).astype(bool)
+        if inside.shape != values.shape:
+            raise ValueError(f"mask: shape {tuple(inside.shape)} given beside a height {tuple(values.shape)}")
+        valid &= inside
     if not valid.any():
         raise ValueError("mask: no valid pixel to write")
     if path.suffix.lower() in MESH_SUFFIXES:
         vertices = height_to_points(torch.from_numpy(values)[None], pixel_size) if points is None else points
         return save_mesh(path, vertices, torch.from_numpy(valid), overwrite=overwrite)
-    values = np.where(valid, values, np.nan).astype(values.dtype)
+    values = values if valid.all() else np.where(valid, values, np.nan).astype(values.dtype)
     notes = {"quantity": quantity, "pixel_size": [float(d) for d in pixel_size]}
     if path.suffix.lower() == ".npz":
         extra = {name: as_array(value) for name, value in arrays.items()}
         entries = {quantity: values, "mask": valid, "pixel_size": np.asarray(pixel_size, np.float64)} | extra
-        write: Callable[[BinaryIO], Any] = lambda file: np.savez_compressed(file, allow_pickle=False, **entries)  # noqa: E731
+        write: Callable[[BinaryIO], Any] = lambda file: write_npz(file, entries)  # noqa: E731
     elif path.suffix.lower() == ".npy":
         write = lambda file: np.save(file, values)  # noqa: E731
     else:

@@ -39,6 +39,7 @@ CHANNELS = ("rgb", "rgba", "rgz", "rgza", "rg", "rga", "ag", "xyz", "xyza")
 
 FITS = 0.12  # largest median of | |n| - 1 |; noise of 0.1 in each component gives 0.07, random codes 0.2
 _TIE = 0.01  # differences of misfit below it tell nothing: half a step of 8 bits is 0.004
+_IDLE = 0.4  # blue that follows z by less of its slope (1 or 1/2) says nothing of it
 _GRAY = 0.03  # channels of a background differ by less, JPEG included
 
 
@@ -81,6 +82,41 @@ def unpack(channels: Array, packing: str | None = None) -> Unpacked:
         raise ValueError(f"packing: {packing!r} needs {needed} channels, the file has {channels.shape[-1]}")
     mask = alpha > 0.5 if masked and alpha is not None else None
     return Unpacked(_clean(base, _DECODE[base](c)), mask, base + "a" * masked)
+
+
+def unpack_rgb(codes: Array) -> tuple[Array, Array]:
+    """Normals (N, 3, H, W) in float32 of pictures (N, H, W, 3) read as `rgb`; for which (N,) `unpack` does so for sure.
+
+    It does where of more than half of the foreground the length is within `_TIE` of 1 and no angle is grazing, and blue
+    follows z: a median within a bound is known by counting.
+    """
+    planes = np.ascontiguousarray(np.moveaxis(codes, -1, 0))
+    n = planes.astype(np.float64)
+    n /= np.iinfo(codes.dtype).max
+    n *= 2
+    n -= 1
+    x, y, z = n * n
+    flat, square = x + y, x + y + z
+    length = np.sqrt(square)
+    largest, least = planes.max(0), planes.min(0)
+    foreground = (largest > 0) & (largest - least >= _GRAY * np.iinfo(codes.dtype).max)
+    usual = (np.abs(length - 1) <= _TIE) & (z >= 0.101**2) & (np.maximum(x, y) <= 0.949**2)
+    sure = [_follows(n[2, k], flat[k], part, usual[k]) for k, part in enumerate(foreground)]
+    low, high = _LENGTHS["rgb"]
+    if not ((length > low) & (length < high)).all():
+        n = np.where((length > low) & (length < high), n, 0)
+    n /= np.maximum(length, 0.1)
+    return np.moveaxis(n, 0, 1).astype(np.float32), np.array(sure)
+
+
+def _follows(blue: Array, flat: Array, chosen: Array, usual: Array) -> bool:
+    """Whether more than half of the chosen pixels are usual, and blue surely follows z; flat is x^2 + y^2."""
+    defined = chosen & (flat <= 1.1)
+    root, blue = np.sqrt(np.clip(1 - flat[defined], 0, None)), blue[defined]
+    root -= root.mean() if root.size else 0
+    follows = abs(float(np.dot(blue, root))) >= (_IDLE + 0.1) * float(np.dot(root, root))
+    enough = np.count_nonzero(chosen & usual) > 0.5 * np.count_nonzero(chosen)
+    return bool(enough and follows and blue.size <= 1_000_000)
 
 
 def _scaled(channels: Array) -> list[Array]:
@@ -195,7 +231,7 @@ def _is_idle(n: Array, blue: Array) -> bool:
         return False
     z, blue = z[defined], blue[defined]
     z = z - z.mean()
-    return bool(abs(2 * (blue * z).sum()) < 0.4 * (z * z).sum())
+    return bool(abs(2 * (blue * z).sum()) < _IDLE * (z * z).sum())
 
 
 def _alpha_is_x(c: Array) -> bool:

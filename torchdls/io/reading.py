@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from torchdls.io import Field
 
 _CLEARLY = 2.0  # a reading this many times as integrable as another is worth a word
+_SURELY = 0.99  # whatever sums round by
 _FLAT = 0.02  # residuals below it are rounding, whichever is smaller
 
 
@@ -90,6 +91,14 @@ def _most_integrable(
         f"under convention {guess.convention!r} the normals are {times} more nearly those of a surface "
         f"than under {name!r}; --convention {guess.convention} or auto takes it"
     )
+
+
+def says_nothing(residual: dict[str, Tensor], name: str) -> Tensor:
+    """Of which maps (N,) `read_normals` surely has no word about the convention, from the residuals under each."""
+    import torch
+
+    here, best = residual[name], torch.stack(list(residual.values())).amin(0)
+    return (here < _SURELY * _FLAT) | (here < _SURELY * _CLEARLY * best)
 
 
 def _tiles(
