@@ -1,9 +1,12 @@
 """Folders of maps: `python -m benchmarks.speed.batch` (some minutes; --smoke, or --only NAME).
 
-Measures, on whatever else the machine does, in turns:
+Measures, in turns, and says how much else the machine does:
 
-- ranks: maps of six sizes by `torchdls batch`, one process against two, seconds from the first map to the last.
-- batched: 64 x 64 maps by least squares, from the tensor and from the file, against one call for each in one process.
+- ranks: 2,000 maps of six sizes by `torchdls batch`, one process against two: seconds from the first result to the
+  last, and seconds of the cores without the start. To be judged where nothing else runs: `--only ranks`.
+- batched: 64 x 64 maps from file to file, `torchdls batch` in one process against `torchdls integrate` called for each
+  in one process (by `torchdls.cli.main`, and by the functions behind it), and against reading and writing alone; then
+  the solver alone, from the tensor. Time of the core; files in memory where there is such a folder.
 - waiting: two processes of two threads, with threads that wait asleep (OMP_WAIT_POLICY=PASSIVE) and as they come.
 - bookkeeping: what finding a map, its claim and its line in the report cost.
 """
@@ -13,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -28,8 +32,11 @@ from PIL import Image
 
 from benchmarks.common.report import results_folder, write_json
 from torchdls import LeastSquares, gradient_to_normals, integrate_many
-from torchdls.batch import Claims, Report, find_maps, plan
+from torchdls.batch import Claims, Manner, Report, Source, find_maps, plan, read_map, write_map
 from torchdls.cli import main as torchdls
+from torchdls.cli.main import _parser as torchdls_parser
+from torchdls.cli.methods import build_method
+from torchdls.io.formats import read_file
 from torchdls.surfaces import SURFACES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,42 +57,82 @@ def write_maps(folder: Path, count: int, sizes: list[tuple[int, int]]) -> list[t
     return found
 
 
-def run_ranks(source: Path, out: Path, world: int, options: list[str]) -> float:
-    """Seconds from the first result to the last: the start of Python and PyTorch, some seconds, is left out."""
+def run_ranks(source: Path, out: Path, world: int, options: list[str]) -> dict[str, float]:
+    """Seconds from the first result to the last (the start of Python and PyTorch is left out), and of the cores."""
     command = [sys.executable, "-m", "torchdls", "batch", str(source), "--out", str(out), "--quiet", *options]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     ranks = [
         subprocess.Popen(command, cwd=ROOT, env=os.environ | {"RANK": str(k), "WORLD_SIZE": str(world)})
         for k in range(world)
     ]
     assert [rank.wait() for rank in ranks] == [0] * world
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cores = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     times = sorted(path.stat().st_mtime for path in out.glob("*.npz"))
-    return times[-1] - times[0]
+    return {"wall": times[-1] - times[0], "cores": cores}
 
 
 def ranks(smoke: bool, scratch: Path) -> dict[str, Any]:
-    count, repeats = (12, 1) if smoke else (2000, 1)
+    count, repeats = (12, 1) if smoke else (2000, 2)
     write_maps(scratch / "six", count, SIX)
-    rows: dict[str, Any] = {"maps": count}
-    methods = {"least_squares": ["--method", "least_squares"], "slope_dls": ["--set", "recipe=quick"]}
+    write_maps(scratch / "two", 2, SIX)
+    rows: dict[str, Any] = {"maps": count, "load_before": os.getloadavg()}
+    methods = {"slope_dls": ["--set", "recipe=quick"], "least_squares": ["--method", "least_squares"]}
     for method, options in methods.items():
-        seconds: dict[int, list[float]] = {1: [], 2: []}
+        start = run_ranks(scratch / "two", scratch / f"{method}-start", 1, options)["cores"]
+        found: dict[int, list[dict[str, float]]] = {1: [], 2: []}
         for repeat in range(repeats):
-            for world in seconds:
-                out = scratch / f"{method}-{repeat}-{world}"
-                seconds[world].append(run_ranks(scratch / "six", out, world, options))
-                print(f"{method}: {world} ranks {seconds[world][-1]:.1f} s", flush=True)
-        rows[method] = {"seconds": seconds, "gain": median(seconds[1]) / max(median(seconds[2]), 1e-9)}
+            for world, seconds in found.items():
+                took = run_ranks(scratch / "six", scratch / f"{method}-{repeat}-{world}", world, options)
+                seconds.append(took | {"cores": took["cores"] - world * start})
+                print(f"{method}: {world} ranks", seconds[-1], flush=True)
+        least = {world: {k: min(s[k] for s in seconds) for k in ("wall", "cores")} for world, seconds in found.items()}
+        rows[method] = {"start": start, "seconds": found, "gain": least[1]["wall"] / max(least[2]["wall"], 1e-9)}
+        rows[method]["gain of two cores, by their time"] = 2 * least[1]["cores"] / max(least[2]["cores"], 1e-9)
     return rows
 
 
-def per_map(run: Callable[[], Any], count: int, repeats: int) -> float:
-    """Milliseconds for each map, the least of some runs: the neighbours on the machine only add to it."""
-    times = []
+def per_map(runs: dict[str, Callable[[], Any]], count: int, repeats: int) -> dict[str, float]:
+    """Milliseconds of the core for each map, the least of some rounds in turns: the neighbours only add to it."""
+    times: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(repeats):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return 1e3 * min(times) / count
+        for name, run in runs.items():
+            start = time.process_time()
+            run()
+            times[name].append(time.process_time() - start)
+    return {name: 1e3 * min(found) / count for name, found in times.items()}
+
+
+def from_file_to_file(folder: Path, files: list[str], options: list[str], suffix: str) -> dict[str, Callable[[], Any]]:
+    """The ways to do all files, each anew every time."""
+    out, quiet = folder / "single", ["--quiet", "--force", *options]
+    out.mkdir(exist_ok=True)
+    arguments = torchdls_parser().parse_args(["integrate", files[0], "-o", "x", *options])
+    manner = Manner()
+
+    def command() -> None:
+        for path in files:
+            torchdls(["integrate", path, "-o", str(out / f"{Path(path).stem}.{suffix}"), *quiet])
+
+    def functions() -> None:
+        integrator = build_method(arguments.method, (1.0, 1.0), arguments.set)
+        with torch.no_grad():
+            for path in files:
+                found = read_map(Source(path), manner)
+                height = integrator(found.gradient, found.mask, found.weight)
+                write_map(out / f"{Path(path).stem}.{suffix}", height, found, overwrite=True)
+
+    def files_alone() -> None:
+        for path in files:
+            read_file(Path(path), (".png",))
+            write_map(out / f"{Path(path).stem}.{suffix}", height, found, overwrite=True)
+
+    def batch() -> None:
+        torchdls(["batch", *files, "--out", str(folder / suffix), "--format", suffix, "--workers", "0", *quiet])
+
+    found = read_map(Source(files[0]), manner)
+    height = LeastSquares()(found.gradient)
+    return {"integrate": command, "its functions": functions, "batch": batch, "reading and writing alone": files_alone}
 
 
 def batched(smoke: bool, scratch: Path) -> dict[str, Any]:
@@ -93,31 +140,31 @@ def batched(smoke: bool, scratch: Path) -> dict[str, Any]:
     count, repeats = (4, 1) if smoke else (320, 5)
     slopes = write_maps(scratch / "small", count, [(64, 64)])
     files = [str(path) for path in sorted((scratch / "small").iterdir())]
-    integrator, out = LeastSquares(), str(scratch / "small-out")
-    (scratch / "single").mkdir()
-    quiet = ["--quiet", "--force", "--method", "least_squares"]
+    integrator = LeastSquares()
 
     def one_by_one() -> None:
         with torch.no_grad():
             for g in slopes:
                 integrator(g)
 
-    def command() -> None:
-        for path in files:
-            torchdls(["integrate", path, "-o", str(scratch / "single" / f"{Path(path).stem}.npy"), *quiet])
-
-    loops = {
-        "solver, one by one": one_by_one,
-        "solver, integrate_many": lambda: list(integrate_many(slopes, integrator)),
-        "files, integrate": command,
-        "files, batch": lambda: torchdls(["batch", *files, "--out", out, "--format", "npy", "--workers", "0", *quiet]),
-    }
-    found = {name: per_map(run, count, repeats) for name, run in loops.items()}
-    return {
-        "ms": found,
-        "gain of the solver": found["solver, one by one"] / found["solver, integrate_many"],
-        "gain of files": found["files, integrate"] / found["files, batch"],
-    }
+    found: dict[str, Any] = {}
+    solver = {"one by one": one_by_one, "integrate_many": lambda: list(integrate_many(slopes, integrator))}
+    found["least_squares, solver"] = per_map(solver, count, repeats)
+    few = 2 if smoke else 16
+    for name, options, suffix, most in (
+        ("least_squares, NPY", ["--method", "least_squares"], "npy", count),
+        ("least_squares, NPZ", ["--method", "least_squares"], "npz", count),
+        ("slope_dls, recipe=quick, NPZ", ["--set", "recipe=quick"], "npz", few),
+        ("slope_dls, NPZ", [], "npz", few // 2),
+    ):
+        (scratch / name).mkdir()
+        runs = from_file_to_file(scratch / name, files[:most], options, suffix)
+        found[name] = per_map(runs, most, repeats if most == count else 1)
+        print(name, found[name], flush=True)
+    for times in found.values():
+        ways = [times[way] for way in ("integrate", "its functions", "one by one") if way in times]
+        times["gain"] = [way / times.get("batch", times.get("integrate_many", way)) for way in ways]
+    return found
 
 
 _THREADS = """
@@ -184,7 +231,7 @@ def main() -> None:
     stored = folder / "batch.json"
     found = json.loads(stored.read_text())["parts"] if stored.exists() and not args.smoke else {}
     for name in args.only or PARTS:
-        with tempfile.TemporaryDirectory() as scratch:
+        with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as scratch:
             found[name] = PARTS[name](args.smoke, Path(scratch))
         print(name, json.dumps(found[name], indent=2), flush=True)
     write_json(stored, parts=found)
