@@ -42,9 +42,8 @@ class SpectralPath(Integrator):
     Raises:
         ValueError: an option is out of its range.
 
-    Source: after Robles-Kelly, Hancock, "A graph-spectral approach to shape-from-shading", IEEE TIP 13(7), 2004, and
-    "Steady state random walks for path estimation", 2004. Theirs has eight neighbours and another rule for going back
-    (not confirmed); four here.
+    Source: after Robles-Kelly, Hancock, "A graph-spectral method for surface height recovery", Pattern Recognition
+    38(8), 2005. Theirs has eight neighbours and another rule for going back (not confirmed); four here.
 
     Example:
         >>> slopes = torch.ones(1, 2, 16, 16)  # of a plane
