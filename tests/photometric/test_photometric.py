@@ -196,6 +196,29 @@ def test_black_images_and_constant_scale(method):
     torch.testing.assert_close(scaled.normals, method(images, lights).normals, atol=1e-8, rtol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["terrain", "peaks"])
+def test_from_ten_noisy_images_no_default_loses_to_least_squares(name):
+    """The paper's third experiment, small, means of four draws: on texture, where nothing is to be gained, it remains."""
+    surface, factor = (torchdls.terrain(64), 3.0) if name == "terrain" else (SURFACES[name](64), 1.0)
+    lights, truth = ring_of_lights(10), surface.height * factor
+    clean = gradient_to_normals(surface.gradient * factor).expand(4, -1, -1, -1)
+    images = render(clean, lights, snr_db=17, generator=seeded(8))
+    slopes = torchdls.normals_to_gradient(woodham(images, lights, shadow=None).normals).gradient
+
+    def errors(method):
+        z = method(slopes)
+        h = truth.expand_as(z)
+        values = torchdls.rmse(z, h), torchdls.mean_angular_error(z, h)
+        return torch.stack([*values, 1 - torchdls.ssim(z, h, surface.data_range * factor)]).mean(1)
+
+    plain = errors(torchdls.LeastSquares())
+    for method in (torchdls.DLS(), torchdls.SlopeDLS(), torchdls.SlopeDLS.fast()):
+        assert (errors(method) <= 1.001 * plain).all(), method
+    if name == "terrain":  # the iteration without its guard does lose there
+        assert errors(torchdls.DLS(select=False))[1] > 1.1 * plain[1]
+
+
 # ---- parts and derivatives
 
 

@@ -43,8 +43,8 @@ def slope_noise(normals: Tensor, covariance: Tensor, *, camera: Tensor | None = 
 
     with S = (-1, 0, 0; 0, 1, 0) and c = (0, 0, 1), or those of the camera. A steep slope is noisier across its rise
     than along it; integrators take the diagonal (`weight`), the correlation of the two components is left out there.
-    On photometric normals it was no better than `PhotometricResult.confidence`, which is one trust for both
-    components.
+    On photometric normals of ten images it was no better than `PhotometricResult.confidence`, which is one trust for
+    both components; nor are the variances of the true normals (benchmarks/results/third_experiment.md).
 
     Args:
         normals: (N, 3, H, W) or (3, H, W), canonical (x right, y up, z to the viewer), of the length that the
