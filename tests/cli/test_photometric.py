@@ -10,6 +10,7 @@ from tests.cli.test_cli import fails
 from tests.photometric.test_lights import ball
 from torchdls import (
     SURFACES,
+    dlnv_normals,
     gradient_to_normals,
     io,
     load_field,
@@ -69,6 +70,17 @@ def test_files_hold_albedo_confidence_and_the_noise_of_the_normals(folder, tmp_p
             values = torch.from_numpy(held["normals"])[None]
             weight = slope_noise(values, torch.from_numpy(held["covariance"])[None]).weight
             assert (weight > 0).all()
+
+
+def test_options_of_the_method(folder, tmp_path, capsys):
+    out = tmp_path / "n.npy"
+    call = ["photometric", folder, "--normals", out, "--method", "dlnv", "--quiet"]
+    assert main([str(a) for a in [*call, "--method-set", "n_iter=1", "--method-set", "lam=0.1"]]) == 0
+    expected = dlnv_normals(load_photographs(folder).images, LIGHTS.float(), n_iter=1, lam=0.1).normals[0]
+    np.testing.assert_allclose(np.load(out), expected.numpy(), atol=1e-6)
+    assert "dlnv has no option 'degree'" in fails(capsys, *call, "--force", "--method-set", "degree=2")
+    assert "lam=much given, a number" in fails(capsys, *call, "--force", "--method-set", "lam=much")
+    assert "--method-set: 'lam' given" in fails(capsys, *call, "--force", "--method-set", "lam")
 
 
 def test_lights_may_come_from_a_ball_and_intensities_from_a_file(folder, tmp_path):

@@ -199,7 +199,7 @@ def test_black_images_and_constant_scale(method):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["terrain", "peaks"])
 def test_from_ten_noisy_images_no_default_loses_to_least_squares(name):
-    """The paper's third experiment, small, means of four draws: on texture, where nothing is to be gained, it remains."""
+    """The paper's third experiment, small, means of four draws; on texture it remains."""
     surface, factor = (torchdls.terrain(64), 3.0) if name == "terrain" else (SURFACES[name](64), 1.0)
     lights, truth = ring_of_lights(10), surface.height * factor
     clean = gradient_to_normals(surface.gradient * factor).expand(4, -1, -1, -1)

@@ -32,14 +32,14 @@ def check_method(name: str, settings: Sequence[str] = (), option: str = "--metho
     if name not in INTEGRATORS:
         raise ValueError(f"{option}: {name!r} is unknown; choose from {', '.join(INTEGRATORS)}")
     known = {key: default for key, default in INTEGRATORS.parameters(name).items() if key != "pixel_size"}
-    for key, value in _options(settings).items():
+    for key, value in options_of(settings).items():
         if key == "pixel_size":
             raise ValueError("--set: pixel_size has an option of its own, --pixel-size")
         if key not in known:
             options = ", ".join(f"{option}={_word(default)}" for option, default in known.items()) or "none"
             raise ValueError(f"--set: {name} has no option {key!r}; its options and their defaults: {options}")
         _check_option(name, key, value, known[key])
-    INTEGRATORS[name](**_options(settings))  # a ValueError of what does not go together, before any work
+    INTEGRATORS[name](**options_of(settings))  # a ValueError of what does not go together, before any work
 
 
 def _check_option(name: str, key: str, value: Any, default: Any) -> None:
@@ -64,13 +64,13 @@ def _word(value: Any) -> str:
     return value if isinstance(value, str) else repr(value)
 
 
-def _options(settings: Sequence[str]) -> dict[str, Any]:
+def options_of(settings: Sequence[str], option: str = "--set") -> dict[str, Any]:
     """The values of words `name=value`: numbers, True, False, None, tuples, or words such as learner=k_svd."""
     options: dict[str, Any] = {}
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not equals or not key.isidentifier():
-            raise ValueError(f"--set: {setting!r} given, NAME=VALUE is needed")
+            raise ValueError(f"{option}: {setting!r} given, NAME=VALUE is needed")
         try:
             options[key] = ast.literal_eval(value)
         except (ValueError, SyntaxError, MemoryError, RecursionError):
@@ -87,7 +87,7 @@ def build_method(
 ) -> Integrator:
     """The integrator of that name, with options given as words `name=value`, and the focal length of a camera."""
     check_method(name, settings, option)
-    return INTEGRATORS[name](pixel_size=pixel_size, **camera_options(name, camera) | _options(settings))
+    return INTEGRATORS[name](pixel_size=pixel_size, **camera_options(name, camera) | options_of(settings))
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchdls._registry import INTEGRATORS, PHOTOMETRIC
-from torchdls.cli.methods import build_method, check_method, run_method
+from torchdls.cli.methods import build_method, check_method, options_of, run_method
 from torchdls.cli.pictures import OUTPUTS, Shown, check_outputs, is_picture, maps_of, write_picture
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def add_photometric(commands: Any) -> None:
     add("--method", default=_METHOD, help=f"{', '.join(PHOTOMETRIC)} (default: {_METHOD})")
     add("--integrator", default=_INTEGRATOR, help=f"{', '.join(INTEGRATORS)} (default: {_INTEGRATOR})")
     add("--set", action="append", default=[], metavar="NAME=VALUE", help="option of the integrator, such as lam=0.5")
+    add("--method-set", action="append", default=[], metavar="NAME=VALUE", help="option of the method, as shadow=0.1")
     add("--weigh", action="store_true", help="weigh each slope by its confidence")
     add("--refine", action="store_true", help="polish the surface by the images themselves")
     add("--lights", metavar="FILE", help="directions of the lights, in place of the folder's own")
@@ -59,6 +60,7 @@ def _photometric(arguments: argparse.Namespace) -> None:
         raise ValueError("nothing to write: give -o OUT for the surface, or --normals OUT for the normal map")
     if arguments.method not in PHOTOMETRIC:
         raise ValueError(f"--method: {arguments.method!r} is unknown; choose from {', '.join(PHOTOMETRIC)}")
+    options = _options(arguments.method, arguments.method_set)
     if not arguments.pixel_size > 0:
         raise ValueError(f"--pixel-size: {arguments.pixel_size} given, a positive number is needed")
     check_method(arguments.integrator, arguments.set, "--integrator")
@@ -70,7 +72,7 @@ def _photometric(arguments: argparse.Namespace) -> None:
     lights, source = _lights(arguments.folder, photographs)
     images, mask = photographs.images, _object(photographs)
     with torch.no_grad():
-        found = PHOTOMETRIC.find(arguments.method)(images, lights, mask=mask)
+        found = PHOTOMETRIC.find(arguments.method)(images, lights, mask=mask, **options)
         if not bool((found.normals != 0).any()):
             raise ValueError(f"{arguments.folder}: no pixel has a normal; three lights must reach it")
         if arguments.normals is not None:
@@ -85,6 +87,20 @@ def _photometric(arguments: argparse.Namespace) -> None:
         k, (h, w) = images.shape[1], images.shape[-2:]
         print(f"{arguments.folder}: {k} pictures of {h} x {w}, lights from {source}")
         print(f"{arguments.method}, {arguments.integrator}: {seconds:.2f} s -> {', '.join(outputs)}")
+
+
+def _options(name: str, settings: list[str]) -> dict[str, Any]:
+    """Options of a photometric method from words `name=value`; ValueError for what it does not have, or no number."""
+    fields = ("images", "lights", "mask", "lit")
+    known = {key: default for key, default in PHOTOMETRIC.parameters(name).items() if key not in fields}
+    options = options_of(settings, "--method-set")
+    for key, value in options.items():
+        if key not in known:
+            listed = ", ".join(f"{option}={default}" for option, default in known.items())
+            raise ValueError(f"--method-set: {name} has no option {key!r}; its options and their defaults: {listed}")
+        if isinstance(known[key], int | float) and not isinstance(value, int | float | None):
+            raise ValueError(f"--method-set: {key}={value} given, a number is needed (default: {known[key]})")
+    return options
 
 
 def _lights(folder: str, photographs: Photographs) -> tuple[Tensor, str]:

@@ -57,8 +57,8 @@ def bivariate_normals(
         n_iter: splitting steps, at least 1.
 
     Returns:
-        PhotometricResult(normals, albedo, confidence); the albedo is the brightness along the normal that least squares
-        gives for these normals.
+        PhotometricResult(normals, albedo, confidence, covariance); the albedo is the brightness along the normal that
+        least squares gives for these normals.
 
     Raises:
         TypeError: an argument has the wrong type.

@@ -34,7 +34,7 @@ def woodham(
         shadow: from 0 to below 1; None uses every sample, as the paper's experiment does.
 
     Returns:
-        PhotometricResult(normals, albedo, confidence).
+        PhotometricResult(normals, albedo, confidence, covariance).
 
     Raises:
         TypeError: an argument has the wrong type.

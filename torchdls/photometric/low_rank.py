@@ -45,7 +45,7 @@ def low_rank_normals(
         tol: relative misfit and change at which a surface stops.
 
     Returns:
-        PhotometricResult(normals, albedo, confidence).
+        PhotometricResult(normals, albedo, confidence, covariance).
 
     Raises:
         TypeError: an argument has the wrong type.

@@ -50,7 +50,7 @@ def sparse_normals(
         n_iter: iterations, at least 1.
 
     Returns:
-        PhotometricResult(normals, albedo, confidence).
+        PhotometricResult(normals, albedo, confidence, covariance).
 
     Raises:
         TypeError: an argument has the wrong type.
