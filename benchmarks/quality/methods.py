@@ -21,7 +21,6 @@ from torchdls import (
     INTEGRATORS,
     SURFACES,
     AnisotropicDiffusion,
-    GaussianKernels,
     MEstimator,
     MumfordShah,
     SlopeDLS,
@@ -35,7 +34,6 @@ FIRST = ("least_squares", "l1", "slope_dls")
 # Forms that are not the default.
 FORMS = {
     "slope_dls (robust)": SlopeDLS(robust=True),
-    "gaussian_kernels (sigma = 2, lam = 1)": GaussianKernels(2.0, 1.0),
     "m_estimator (joint)": MEstimator(joint=True),
     "anisotropic_diffusion (follow = field)": AnisotropicDiffusion(follow="field"),
     "mumford_shah (4 indicators)": MumfordShah(indicators=4),
