@@ -84,7 +84,7 @@ pictures: $(VENV)/.dev
 
 # The site, into build/site; a broken link or name stops it.
 docs: $(VENV)/.dev
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench-smoke: $(VENV)/.dev
 	$(if $(BENCH_TESTS),$(BIN)/python -m pytest --benchmark-disable --quiet -k "$(SMOKE_SIZES)" $(BENCH_TESTS))

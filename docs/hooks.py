@@ -69,7 +69,8 @@ def reference() -> str:
     for room, names in rooms.items():
         if names:
             parts.append(f"\n## {ROOMS.get(room, room)}\n")
-            parts += [table(name) if name in TABLES else entry(name) for name in names]
+            tables_first = sorted(names, key=lambda name: name not in TABLES)
+            parts += [table(name) if name in TABLES else entry(name) for name in tables_first]
     return "\n".join(parts)
 
 

@@ -260,18 +260,18 @@ def gradient_channels(n: int) -> Figure:
 
 def tutorial_map(n: int) -> Image.Image:
     """The preview of the first path."""
-    return by_command(lambda folder: write_normal_map(folder, n, noise=0.02), "integrate")
+    return by_command(lambda folder: write_normal_map(folder, n, noise=0.02), "integrate", "relief")
 
 
 def tutorial_photographs(n: int) -> Image.Image:
     """The preview of the second path."""
-    return by_command(lambda folder: write_photographs(folder, n), "photometric")
+    return by_command(lambda folder: write_photographs(folder, n), "photometric", "photographs")
 
 
-def by_command(make: Callable[[Path], Any], command: str) -> Image.Image:
-    """A preview that the command line writes."""
+def by_command(make: Callable[[Path], Any], command: str, name: str) -> Image.Image:
+    """A preview that the command line writes of a folder of that name."""
     with tempfile.TemporaryDirectory() as place:
-        folder, out = Path(place) / "relief", Path(place) / "relief_preview.png"
+        folder, out = Path(place) / name, Path(place) / "made_preview.png"
         make(folder)
         if torchdls_command([command, str(folder), "-o", str(out), "--quiet"]):
             raise SystemExit(f"torchdls {command} failed")

@@ -20,7 +20,7 @@ def commands(heading):
     """The commands under a heading, without the installation."""
     section = TUTORIAL.read_text(encoding="utf-8").partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
     assert section, f"no heading {heading!r}"
-    lines = "\n".join(re.findall(r"```console\n(.*?)```", section, re.DOTALL)).splitlines()
+    lines = "\n".join(re.findall(r"```console\n(.*?)```", section, re.DOTALL)).replace("\\\n", "").splitlines()
     assert all(line.startswith(("pip install", "torchdls ")) for line in lines)
     return [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("torchdls")]
 

@@ -48,13 +48,20 @@ def test_a_folder_becomes_a_surface_and_a_normal_map(folder, tmp_path, capsys):
     out, normals = tmp_path / "z.npz", tmp_path / "n.png"
     arguments = ["photometric", folder, "-o", out, "-o", tmp_path / "z.ply", "--normals", normals]
     assert main([str(a) for a in [*arguments, "--integrator", "least_squares"]]) == 0
-    assert "6 pictures of 32 x 32, lights from file" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "6 pictures of 32 x 32, lights from file" in told
+    assert "woodham, least_squares: 1024 of 1024 pixels in " in told
     surface = SURFACES["peaks"](32, dtype=torch.float64)
     assert rmse(io.load_height(out).height.double(), surface.height) < 0.05 * surface.height.std()
     field = load_field(normals)
     expected = gradient_to_normals(surface.gradient)
     assert (field.values.double() - expected)[..., 2:-2, 2:-2].abs().mean() < 0.01
     assert main([str(a) for a in [*arguments, "--force", "--refine", "--method", "dlnv", "--quiet"]]) == 0
+    assert capsys.readouterr().out == ""
+    assert main(["photometric", str(folder), "-o", str(tmp_path / "slope_dls.npz")]) == 0
+    assert " in the slopes, in " in capsys.readouterr().out
+    assert main(["photometric", str(folder), "--normals", str(tmp_path / "alone.png")]) == 0
+    assert "\nwoodham: 1024 of 1024 pixels in " in capsys.readouterr().out
 
 
 def test_files_hold_albedo_confidence_and_the_noise_of_the_normals(folder, tmp_path):

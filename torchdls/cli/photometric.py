@@ -77,16 +77,15 @@ def _photometric(arguments: argparse.Namespace) -> None:
             raise ValueError(f"{arguments.folder}: no pixel has a normal; three lights must reach it")
         if arguments.normals is not None:
             io.save_normals(arguments.normals, found.normals, mask=mask, overwrite=arguments.force, **_said(found))
-        if arguments.out:
-            _surface(arguments, images, lights, mask, found)
+        noise = _surface(arguments, images, lights, mask, found) if arguments.out else None
     if not arguments.quiet:
-        seconds, outputs = (
-            time.perf_counter() - start,
-            [*arguments.out, *([arguments.normals] * bool(arguments.normals))],
-        )
-        k, (h, w) = images.shape[1], images.shape[-2:]
+        seconds, k, (h, w) = time.perf_counter() - start, images.shape[1], images.shape[-2:]
+        outputs = [*arguments.out, *([arguments.normals] * bool(arguments.normals))]
+        pixels = int((found.normals != 0).any(1).sum())
+        level = "" if noise is None else f", noise {noise:.3g} in the slopes,"
+        names = ", ".join([arguments.method, *([arguments.integrator] * bool(arguments.out))])
         print(f"{arguments.folder}: {k} pictures of {h} x {w}, lights from {source}")
-        print(f"{arguments.method}, {arguments.integrator}: {seconds:.2f} s -> {', '.join(outputs)}")
+        print(f"{names}: {pixels} of {h * w} pixels{level} in {seconds:.2f} s -> {', '.join(outputs)}")
 
 
 def _options(name: str, settings: list[str]) -> dict[str, Any]:
@@ -126,7 +125,10 @@ def _said(found: Any) -> dict[str, Any]:
     return {"albedo": found.albedo[0, 0], "confidence": found.confidence[0, 0], "covariance": found.covariance[0]}
 
 
-def _surface(arguments: argparse.Namespace, images: Tensor, lights: Tensor, mask: Tensor | None, found: Any) -> None:
+def _surface(
+    arguments: argparse.Namespace, images: Tensor, lights: Tensor, mask: Tensor | None, found: Any
+) -> float | None:
+    """Write the surface; the noise level of the slopes, where the integrator reads it."""
     from torchdls import io
     from torchdls.geometry import normals_to_gradient
     from torchdls.photometric import refine
@@ -152,3 +154,5 @@ def _surface(arguments: argparse.Namespace, images: Tensor, lights: Tensor, mask
                 normals=found.normals[0], gradient=field.gradient[0], **_said(found),
                 **{name: maps[name][0] for name in maps},
             )  # fmt: skip
+    noise = result._asdict().get("noise")
+    return None if noise is None else float(noise)
