@@ -30,7 +30,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.common.report import results_folder, write_json
+from benchmarks.common.report import AT_START, results_folder, write_json
 from torchdls import LeastSquares, gradient_to_normals, integrate_many
 from torchdls.batch import Claims, Manner, Report, Source, find_maps, plan, read_map, write_map
 from torchdls.cli import main as torchdls
@@ -232,7 +232,7 @@ def main() -> None:
     found = json.loads(stored.read_text())["parts"] if stored.exists() and not args.smoke else {}
     for name in args.only or PARTS:
         with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as scratch:
-            found[name] = PARTS[name](args.smoke, Path(scratch))
+            found[name] = PARTS[name](args.smoke, Path(scratch)) | {"commit": AT_START["commit"]}
         print(name, json.dumps(found[name], indent=2), flush=True)
     write_json(stored, parts=found)
 

@@ -21,21 +21,35 @@ TIFF_TILE = 256
 
 @dataclass(frozen=True)
 class Field:
-    """A gradient or normals, of which only what is asked for is read.
+    """A gradient or normals, and what comes beside them, of which only what is asked for is read.
 
     Args:
         array: anything with `shape` and `dtype` that gives arrays for slices.
         convention: of the gradient or the normals; None for the default.
         mask: likewise, (H, W), not 0 where the slopes are valid; None for a full rectangle.
+        weight: (H, W), (1, H, W) or (2, H, W), trust in the slopes; None for equal trust.
+        anchor: (H, W), known heights, or None.
+        anchor_weight: (H, W) or one number, trust in them.
     """
 
     array: Any
     convention: str | None = None
     mask: Any = None
+    weight: Any = None
+    anchor: Any = None
+    anchor_weight: Any = None
 
     @classmethod
-    def open(cls, source: Any, convention: str | None, mask: Any = None) -> Field:
-        """The field in a file, or of an array; and its mask.
+    def open(
+        cls,
+        source: Any,
+        convention: str | None,
+        mask: Any = None,
+        weight: Any = None,
+        anchor: Any = None,
+        anchor_weight: Any = None,
+    ) -> Field:
+        """The field in a file, or of an array; and what comes beside it.
 
         Raises:
             TypeError: the entries are no floats.
@@ -47,10 +61,28 @@ class Field:
             raise ValueError(f"large.integrate: source {shape} given, (2, H, W) or (3, H, W) is needed")
         if dtype.kind != "f":
             raise TypeError(f"large.integrate: source has dtype {dtype}; floats are needed")
-        mask = None if mask is None else _opened(mask)
-        if mask is not None and tuple(mask.shape) != shape[1:]:
-            raise ValueError(f"large.integrate: mask {tuple(mask.shape)} given for a source {shape}")
-        return cls(array, convention, mask)
+        if (anchor is None) != (anchor_weight is None):
+            given, missing = ("anchor", "anchor_weight") if anchor_weight is None else ("anchor_weight", "anchor")
+            raise ValueError(f"large.integrate: {given} is given without {missing}; they come together")
+        if isinstance(anchor_weight, int | float):
+            anchor_weight = np.broadcast_to(np.float64(anchor_weight), shape[1:])
+        beside = {"mask": mask, "weight": weight, "anchor": anchor, "anchor_weight": anchor_weight}
+        found = {name: None if part is None else _opened(part) for name, part in beside.items()}
+        for name, part in found.items():
+            planes = (shape[1:], (1, *shape[1:]), (2, *shape[1:])) if name == "weight" else (shape[1:],)
+            if part is not None and tuple(part.shape) not in planes:
+                raise ValueError(f"large.integrate: {name} {tuple(part.shape)} given for a source {shape}")
+        return cls(array, convention, **found)
+
+    @property
+    def even(self) -> bool:
+        """A full rectangle with equal trust."""
+        return self.mask is None and self.weight is None
+
+    @property
+    def bare(self) -> bool:
+        """And without anchors."""
+        return self.even and self.anchor is None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -65,7 +97,7 @@ class Field:
     def slopes(self, rows: slice, columns: slice = slice(None)) -> Tensor:
         """(2, h, w) of a part in the library's convention."""
         values = as_tensor(np.array(self.array[:, rows, columns], order="C"))
-        where = f"rows {rows.start} to {rows.stop - 1}"
+        where = _named(rows)
         inside = None if self.mask is None else self.inside(rows, columns)
         if inside is not None:
             values = torch.where(inside, values, 0)
@@ -78,6 +110,31 @@ class Field:
             raise ValueError(f"large.integrate: {int(found.invalid)} normals face away, or are none, in {where}")
         return found.gradient
 
+    def trusts(self, rows: slice) -> Tensor:
+        """(1 or 2, h, W) weights of a band, 0 outside the mask.
+
+        Raises:
+            ValueError: one is negative or not finite.
+        """
+        weight = self.weight[rows][None] if len(self.weight.shape) == 2 else self.weight[:, rows]
+        found = torch.from_numpy(np.array(weight, self.dtype, order="C"))
+        if self.mask is not None:
+            found = torch.where(self.inside(rows), found, 0)
+        return _trusted("weight", found, rows)
+
+    def anchors(self, rows: slice) -> tuple[Array, Array]:
+        """(h, W) heights, 0 where they are not trusted, and the trust in them, 0 outside the mask.
+
+        Raises:
+            ValueError: a trust is negative or not finite, or a height is not finite where it is trusted.
+        """
+        r = torch.from_numpy(np.array(self.anchor_weight[rows], self.dtype, order="C"))
+        r = _trusted("anchor_weight", r if self.mask is None else torch.where(self.inside(rows)[0], r, 0), rows)
+        a = torch.where(r > 0, torch.from_numpy(np.array(self.anchor[rows], self.dtype, order="C")), 0)
+        if not bool(a.isfinite().all()):
+            raise ValueError(f"large.integrate: anchor is not finite in {_named(rows)}, where it is trusted")
+        return a.numpy(), r.numpy()
+
     def inside(self, rows: slice, columns: slice = slice(None)) -> Tensor:
         """(1, h, w) bool of a part of the mask."""
         return torch.from_numpy(np.array(self.mask[rows, columns]) != 0)[None]
@@ -87,6 +144,16 @@ def parts(n: int, size: int) -> Iterator[slice]:
     """0 to n in parts of one size; the last may be shorter."""
     for start in range(0, n, size):
         yield slice(start, min(start + size, n))
+
+
+def _named(rows: slice) -> str:
+    return f"rows {rows.start} to {rows.stop - 1}"
+
+
+def _trusted(name: str, trust: Tensor, rows: slice) -> Tensor:
+    if not bool((trust.isfinite() & (trust >= 0)).all()):
+        raise ValueError(f"large.integrate: {name} is negative or not finite in {_named(rows)}")
+    return trust
 
 
 def _is_path(value: Any) -> bool:

@@ -16,8 +16,8 @@ import torch
 from torchdls.integrators import Integrator, LeastSquares, SlopeDLS
 from torchdls.large.files import Field, checked_output, parts, write
 from torchdls.large.least_squares import least_squares
-from torchdls.large.masked import Masked
 from torchdls.large.slope_dls import HALO, noise_of, slope_dls, spans
+from torchdls.large.system import System
 from torchdls.large.transform import Passes, rows_at_once
 from torchdls.operators import as_pixel_size
 from torchdls.solvers import ConvergenceWarning
@@ -35,7 +35,7 @@ class LargeResult(NamedTuple):
         passes: the bands, strips and bands of the (last) solve.
         tiles: rows and columns of tiles; (0, 0) for least squares, which needs none.
         noise: standard deviation of one gradient sample, as SlopeDLS took it; None for least squares.
-        iterations: of conjugate gradients with a mask, else 0.
+        iterations: of conjugate gradients with a mask, weights or anchors, else 0.
         converged: whether they met the tolerance within the limit of the integrator.
     """
 
@@ -53,6 +53,9 @@ def integrate(
     out: str | os.PathLike[str] | Any,
     *,
     mask: str | os.PathLike[str] | Any = None,
+    weight: str | os.PathLike[str] | Any = None,
+    anchor: str | os.PathLike[str] | Any = None,
+    anchor_weight: str | os.PathLike[str] | Any = None,
     integrator: Integrator | None = None,
     convention: str | None = None,
     pixel_size: float | Sequence[float] | None = None,
@@ -73,11 +76,11 @@ def integrate(
     by one exact solve; slow waves, and how far least squares is left, are then judged by the whole. One tile is
     SlopeDLS itself; more differ by some percent of its error (docs/scale.md).
 
-    With a mask, least squares goes by conjugate gradients whose vectors are files, preconditioned by that of the full
-    rectangle; they stop at the integrator's `tol`.
+    With a mask, weights or anchors, least squares goes by conjugate gradients whose vectors are files, preconditioned
+    by that of the full rectangle; they stop at the integrator's `tol`.
 
     Besides the files it takes `scratch` space of one height (SlopeDLS: two; with a mask: four, and eight bytes for each
-    pixel), and `memory` for its own arrays; time grows as H W log(H W). Weights and anchors are not taken.
+    pixel; with weights or anchors three more), and `memory` for its own arrays; time grows as H W log(H W).
 
     Args:
         source: gradient (2, H, W) or normals (3, H, W) of floats: an NPY file, a Zarr array, an uncompressed TIFF, or
@@ -86,6 +89,9 @@ def integrate(
             that takes arrays for slices of rows.
         mask: (H, W) in a file or an array, not 0 where the slopes are valid; the rest is never read. With least squares
             alone. None for a full rectangle.
+        weight: (H, W), (1, H, W) or (2, H, W) likewise, at least 0: trust in the slopes, for least squares alone.
+        anchor: (H, W) likewise, known heights, read only where `anchor_weight` > 0; for least squares alone.
+        anchor_weight: (H, W) likewise, or one number, at least 0: trust in the anchors.
         integrator: `LeastSquares()`, which None stands for, or `SlopeDLS(...)` with the recipe "blend" or "quick",
             without `robust`, with one noise level or None, and with the guard "discrepancy" or None.
         convention: of the gradient (default: image) or of the normals (default: opengl).
@@ -118,11 +124,12 @@ def integrate(
         True
     """
     method = LeastSquares() if integrator is None else integrator
-    _check(method, tile, halo, mask is not None)
-    field = Field.open(source, convention, mask)
+    given = {"mask": mask, "weight": weight, "anchor": anchor, "anchor_weight": anchor_weight}
+    _check(method, tile, halo, [name for name, part in given.items() if part is not None])
+    field = Field.open(source, convention, **given)
     size, smooths = field.shape, isinstance(method, SlopeDLS)
     held = (
-        rows_at_once(memory, size, field.dtype, 2 if smooths or mask is not None else 1)
+        rows_at_once(memory, size, field.dtype, 3 if weight is not None else 1 if field.bare and not smooths else 2)
         if tile is None or smooths
         else tile
     )
@@ -138,8 +145,8 @@ def integrate(
             level = noise_of(passes, method, windows)
             heights = slope_dls(passes, method, windows, level)
             result = result._replace(tiles=(len(windows[0]), len(windows[1])), noise=float(level))
-        elif isinstance(method, LeastSquares) and mask is not None:
-            system = Masked(passes)
+        elif isinstance(method, LeastSquares) and not field.bare:
+            system = System(passes)
             converged = system.solve(method.tol, method.max_iter)
             result = result._replace(iterations=system.iterations, converged=converged)
             heights = system.heights()
@@ -164,14 +171,14 @@ def _tile(memory: int, halo: int, dtype: Any) -> int:
     return side // 128 * 128 or side
 
 
-def _check(method: Integrator, tile: int | None, halo: int, masked: bool) -> None:
+def _check(method: Integrator, tile: int | None, halo: int, beside: Sequence[str]) -> None:
     if type(method) is LeastSquares:
         usable = method.boundary == "neumann"
     elif type(method) is SlopeDLS:
         single = method.sigma is None or torch.as_tensor(method.sigma).numel() == 1
         usable = method.recipe != "plain" and not method.robust and method.guard != "sure" and single
-        if masked:
-            raise ValueError("large.integrate: mask is given, which least squares alone takes")
+        if beside:
+            raise ValueError(f"large.integrate: {beside[0]} is given, which least squares alone takes")
     else:
         raise TypeError(f"large.integrate: integrator={method!r} given, LeastSquares or SlopeDLS is needed")
     if not usable:

@@ -45,11 +45,13 @@ def columns_back(spectrum: Tensor) -> Array:
     return found
 
 
-def integrated(spectrum: Tensor, columns: slice, size: tuple[int, int], step: tuple[float, float]) -> Tensor:
-    """(columns, H) of A^T v -> of the height: divided by the eigenvalues of A^T A, 0 for the mean; written in place."""
+def integrated(
+    spectrum: Tensor, columns: slice, size: tuple[int, int], step: tuple[float, float], shift: float = 0.0
+) -> Tensor:
+    """(columns, H) of A^T v -> of the height: over the eigenvalues of A^T A + shift, 0 for 0; written in place."""
     y, x = eigenvalues(size, slice(0, size[0]), columns, step)
     for part, own in zip(spectrum, x, strict=True):  # a column at a time: no table of the size of the strip
-        total = y + own
+        total = y + (own + shift)
         singular = total == 0
         part.mul_(torch.where(singular, 0, 1 / torch.where(singular, 1, total)).to(part))
     return spectrum

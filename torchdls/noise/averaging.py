@@ -50,15 +50,20 @@ def averaging_error(
     dx, dy = pixel_size
     unit, cells = normalised(cell_curl(edge_slopes(gradient)[0], (dx, dy)), trust, dx, dy)
     power = robust_scale(unit, cells).nan_to_num(0.0).square()
-    sums = [_third_differences(gradient[:, c], trust[:, c], dim) for c, dim in ((0, -1), (1, -2))]
+    sums = [third_differences(gradient[:, c], trust[:, c], dim) for c, dim in ((0, -1), (1, -2))]
     square, noise, total = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
-    noisy, known = power > 0, (total > 0) & cells.flatten(1).any(1)
+    return error_of(square, noise, total, power, cells.flatten(1).any(1))[:, None, None, None]
+
+
+def error_of(square: Tensor, noise: Tensor, total: Tensor, power: Tensor, told: Tensor) -> Tensor:
+    """(N,) the error from the sums of `third_differences`, the noise variance, and whether any cell tells that."""
+    noisy, known = power > 0, (total > 0) & told
     over = (square / torch.where(noisy, power, 1) - noise) / torch.where(known, total, 1) / 48
     over = torch.where(noisy, over, _LARGEST_ERROR * (square > 0)).clamp(0, _LARGEST_ERROR)
-    return torch.where(known, over, 0)[:, None, None, None]
+    return torch.where(known, over, 0)
 
 
-def _third_differences(g: Tensor, trust: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
+def third_differences(g: Tensor, trust: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
     """(N,) sums of q r^2, q u and q along one axis of (N, H, W), where all four samples are trusted."""
     n = g.shape[dim] - 3
     if n < 1:

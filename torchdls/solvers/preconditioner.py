@@ -13,17 +13,17 @@ from torchdls.solvers.cg import LinearMap
 from torchdls.solvers.direct import direct_map
 
 # From this ratio of anchor to edge weight on, the diagonal is the cheaper preconditioner (measured on a CPU).
-_FIRM = 0.25
+FIRM = 0.25
 
 
 # Side of the blocks over which the preconditioner averages weights.
-_SMOOTH = 16
+BLOCK = 16
 
 
 def preconditioner(w: Tensor, r: Tensor, pixel_size: tuple[float, float], weak: bool = False) -> LinearMap:
     r"""The map b -> S (A^T A + rho)^{-1} S b: a direct solve between two diagonal scalings.
 
-    With d the weight of the edges around a pixel (see `_local_weight`) and k = 2/dx^2 + 2/dy^2 the diagonal of A^T A,
+    With d the weight of the edges around a pixel (see `local_weight`) and k = 2/dx^2 + 2/dy^2 the diagonal of A^T A,
     the scaling s_i^2 = (k + rho) / (k d_i + r_i) matches the diagonals, and rho is the mean of the scaled anchor
     weights s_i^2 r_i: rho = k q / (1 - q) with q = mean(r_i / (k d_i + r_i)). Equal weights give back the exact
     inverse; a few strong control points count as a few pixels however strong they are. Dead pixels (no edge, no
@@ -35,7 +35,7 @@ def preconditioner(w: Tensor, r: Tensor, pixel_size: tuple[float, float], weak: 
     Where the anchors hold every surface firmly the diagonal alone does nearly as well, and costs a tenth.
     """
     k = sum(2 / d**2 for d in pixel_size)
-    total = k * _local_weight(w) + r
+    total = k * local_weight(w) + r
     alive = total > 0
     total = torch.where(alive, total, 1)
     n_alive = alive.sum((-3, -2, -1), keepdim=True).clamp(min=1)
@@ -45,7 +45,7 @@ def preconditioner(w: Tensor, r: Tensor, pixel_size: tuple[float, float], weak: 
     if weak:
         least = min((math.pi / n / d) ** 2 for n, d in zip(w.shape[:-3:-1], pixel_size, strict=True))
         rho = torch.where(rho > 0, rho.clamp(min=0.1 * least), 0)
-    if bool((rho > _FIRM * k).all()):
+    if bool((rho > FIRM * k).all()):
         scale = torch.tensor(pixel_size, dtype=w.dtype, device=w.device).view(1, 2, 1, 1)
         diagonal = edge_ends(w / scale.square()) + r
         inverse = torch.where(alive, 1 / torch.where(alive, diagonal, 1), 0)
@@ -55,13 +55,13 @@ def preconditioner(w: Tensor, r: Tensor, pixel_size: tuple[float, float], weak: 
     return lambda b: s * direct((s * b).float())
 
 
-def _local_weight(w: Tensor) -> Tensor:
+def local_weight(w: Tensor) -> Tensor:
     """(N, 1, H, W): geometric mean of the weights of the live edges within some pixels; 0 where a pixel has none.
 
     Weights that vary from pixel to pixel at random act together as one weight, this mean, while slow changes are felt
     where they are. (Followed pixel by pixel, random weights from .1 to 1 took 490 steps at 256^2; so they take 16.)
     """
-    (h, width), c = w.shape[-2:], _SMOOTH
+    (h, width), c = w.shape[-2:], BLOCK
     live, logs = edge_ends((w > 0).to(w.dtype)), edge_ends(torch.where(w > 0, w, 1).log())
     count, total = (F.avg_pool2d(F.pad(t, (0, -width % c, 0, -h % c)), c) for t in (live, logs))
     blocks = torch.cat([(count > 0).to(w.dtype), total / torch.where(count > 0, count, 1)], 1)
