@@ -322,14 +322,11 @@ def truth(case: Case, f: Any, given: dict[str, Any], result: Any) -> None:
     relief = float(expected.max() - expected.min()) + float(v.abs().max())
     error = float((result.height[0].double() - expected).abs().max())
     size = max(offset, float(expected.abs().max()))
-    edges = (w * present)[w * present > 0]
-    apart = float(edges.max() / edges.min()) if len(edges) else 1.0
-    allowed = (1e-5 if apart < 1e9 else 1e-4) * relief + 8 * torch.finfo(v.dtype).eps * size
-    converged = bool(result.converged.all())
-    if converged and error > allowed:
+    allowed = 1e-5 * relief + 8 * torch.finfo(v.dtype).eps * size
+    if not bool(result.converged.all()):
+        raise Flaw("not converged")
+    if error > allowed:
         raise Flaw(f"off the exact solution by {error / relief:.1e} of the relief")
-    if not converged and apart < 1e9:
-        raise Flaw(f"not converged, with weights {apart:.0e} apart")
 
 
 MAKERS: list[tuple[Callable[[random.Random], Case], int]] = [

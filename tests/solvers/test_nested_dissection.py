@@ -1,5 +1,7 @@
 """The direct solver on masks, against dense and sparse solves of the same matrix."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 import scipy.sparse as sparse
@@ -70,6 +72,43 @@ def test_equals_a_sparse_solve_on_a_larger_mask(generator):
     expected[alive] = spsolve(H[alive][:, alive], b.flatten().numpy()[alive])
     found = factor(weight, r).solve(b).flatten().numpy()
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("orders", [12, 60])
+def test_every_number_of_the_inverse_is_right_at_any_contrast(orders, generator):
+    """Against elimination in rational numbers, each to some units in its last place."""
+    weight = edges_within(
+        torch.ones(1, 1, 3, 7, dtype=torch.bool),
+        10 ** (orders * (torch.rand(1, 2, 3, 7, dtype=torch.float64, generator=generator) - 0.5)),
+    )
+    r = torch.zeros(1, 1, 3, 7, dtype=torch.float64)
+    r[0, 0, 1, 4] = 10.0**-orders
+    found = factor(weight, r)
+    for i in range(0, 21, 4):
+        force = torch.zeros_like(r).flatten()
+        force[i] = 1
+        exact = rational_heights(weight[0], r[0], force)
+        torch.testing.assert_close(found.solve(force.view_as(r)).flatten(), exact, rtol=1e-13, atol=0)
+
+
+def rational_heights(weight, r, force):
+    """H^{-1} f, by Gauss and Jordan in rational numbers."""
+    h, w = r.shape[-2:]
+    n = h * w
+    H = [[Fraction(0)] * n + [Fraction(float(f))] for f in force]
+    for i in range(n):
+        H[i][i] += Fraction(float(r.flatten()[i]))
+    for channel, step in ((0, 1), (1, w)):
+        for i, c in enumerate(weight[channel].flatten().tolist()):
+            if c:
+                j, c = i + step, Fraction(c)
+                H[i][i], H[j][j], H[i][j], H[j][i] = H[i][i] + c, H[j][j] + c, H[i][j] - c, H[j][i] - c
+    for k in range(n):
+        H[k] = [x / H[k][k] for x in H[k]]
+        for i in range(n):
+            if i != k and H[i][k]:
+                H[i] = [x - H[i][k] * y for x, y in zip(H[i], H[k], strict=True)]
+    return torch.tensor([float(row[n]) for row in H], dtype=torch.float64)
 
 
 def test_a_surface_does_not_depend_on_its_batch(generator):

@@ -1,12 +1,10 @@
 """The solve (*) at every scale of slopes, weights, anchors and pixels, against closed forms and SciPy."""
 
-import warnings
-
 import numpy as np
 import pytest
 import torch
 
-from tests.fuzz.values import rational_solve
+from tests.fuzz.values import field, firm, mask, rational_solve, trust
 from tests.helpers import MASKS, random_field, seeded, sparse_solve
 from torchdls import INTEGRATORS, ConvergenceWarning, LeastSquares, edge_slopes, solve
 from torchdls.solvers import conjugate_gradients
@@ -235,7 +233,7 @@ def far_apart(orders, seed, dtype):
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
-@pytest.mark.parametrize("orders", [3, 6, 9])
+@pytest.mark.parametrize("orders", [3, 6, 9, 14, 21])
 def test_weights_of_edges_far_apart(orders, dtype):
     """The tolerance of the firm edges used to swallow the slopes on weak ones: a third of the relief was missing."""
     for seed in range(10):
@@ -248,19 +246,49 @@ def test_weights_of_edges_far_apart(orders, dtype):
         assert torch.equal(solve(v, spoilt).height, found.height)
 
 
-def test_weights_beyond_what_rounding_leaves_warn():
-    seen = 0
-    for seed in range(10):
-        v, w, exact = far_apart(24, seed, torch.float64)
-        with warnings.catch_warnings(record=True) as told:
-            warnings.simplefilter("always")
+@pytest.mark.parametrize(
+    "shape, slopes, weights, held, chosen, firmness, offset",
+    [((3, 4), 428170, 104550, "one", 41, 10.0, 1e6), ((2, 5), 515879, 394098, "some", 762, 1e3, 500.0)],
+)
+def test_firm_anchors_beside_weights_far_apart(shape, slopes, weights, held, chosen, firmness, offset):
+    """Forces lose in rounding what weak edges say: off by .09 and .38 of the relief, and counted as converged."""
+    v, w = field(1, 2, *shape, kind="waves", seed=slopes), trust(1, 2, *shape, kind="orders", seed=weights)
+    r = firm(mask(1, *shape), held, chosen, firmness)
+    anchor = torch.full_like(r, offset)
+    w[:, 0, :, -1] = w[:, 1, -1] = 0
+    found = solve(v, w, anchor, r)
+    assert bool(found.converged.all())
+    assert error(found.height, rational_solve(v[0], w[0], anchor[0], r[0])[None]) < 1e-8
+
+
+def test_derivatives_where_weights_are_far_apart():
+    """By slopes, from solutions for single slopes in rational numbers: heights are linear in them."""
+    v, w, _ = far_apart(16, 3, torch.float64)
+    r, anchor = firm(mask(1, 3, 4), "some", 5, 1e-3), random_field(1, 1, 3, 4, seed=7)
+    probe = random_field(1, 1, 3, 4, seed=8)
+    given, single = v.clone().requires_grad_(), torch.eye(v.numel(), dtype=torch.float64).view(-1, *v.shape[1:])
+    (solve(given, w, anchor, r).height * probe).sum().backward()
+    exact = torch.stack([(rational_solve(one, w[0], 0 * anchor[0], r[0]) * probe[0]).sum() for one in single])
+    torch.testing.assert_close(given.grad.flatten(), exact, rtol=0, atol=1e-12)
+    weight = w.clone().requires_grad_()
+    (solve(v, weight, anchor, r).height * probe).sum().backward()
+    for i in w.flatten().nonzero()[::4, 0]:
+        change = torch.zeros_like(w).flatten()
+        change[i] = 1e-3 * w.flatten()[i]
+        up, down = (
+            (rational_solve(v[0], (w + t * change.view_as(w))[0], anchor[0], r[0]) * probe[0]).sum() for t in (1, -1)
+        )
+        assert float(weight.grad.flatten()[i] * 2 * change[i]) == pytest.approx(float(up - down), rel=1e-4, abs=1e-12)
+
+
+def test_weights_beyond_what_two_numbers_hold_warn():
+    for orders in (40, 300):
+        v, w = random_field(2, 2, 3, 4), torch.ones(2, 2, 3, 4, dtype=torch.float64)
+        w[1, :, :, :2] = 10.0**-orders
+        with pytest.warns(ConvergenceWarning, match="1 of 2 surfaces"):
             found = solve(v, w)
-        assert bool(found.converged.all()) != bool(told)
-        assert not told or issubclass(told[0].category, ConvergenceWarning)
-        seen += bool(told)
-        if not told:
-            assert error(found.height, exact) < 1e-4
-    assert seen > 3
+        assert found.converged.tolist() == [True, False]
+        assert bool(found.height.isfinite().all())
 
 
 def test_conjugate_gradients_return_about_the_best_iterate():

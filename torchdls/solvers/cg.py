@@ -36,7 +36,6 @@ def conjugate_gradients(
     project: LinearMap | None = None,
     deflate: LinearMap | None = None,
     scale: Tensor | None = None,
-    by_steps: bool = False,
 ) -> CGResult:
     """Solve H x = b for every system of the batch.
 
@@ -53,15 +52,13 @@ def conjugate_gradients(
         deflate: oblique projection v -> v - H e (e^T v) / (e^T H e) along directions e that the caller solves for; b
             must have no part along them, and x is right up to them.
         scale: (N,) what residuals are measured by; None for ||b||.
-        by_steps: where `precondition` is nearly the inverse, P r is nearly the error of x: a system stops once
-            ||P r|| <= tol ||x||, which is what comes back as its residual.
 
     A system that has stopped is frozen: its result does not depend on its neighbours in the batch. None ends at a
     residual above ten times the smallest that it has seen, nor above that of 0.
     """
     norm = _norm(b)
     scale = norm if scale is None else scale
-    goal = 0 * scale if by_steps else tol * scale
+    goal = tol * scale
     if x0 is None:
         x, r = torch.zeros_like(b), b.clone()
     else:  # where b = 0 the solution is 0, which no iteration from elsewhere would meet
@@ -74,16 +71,11 @@ def conjugate_gradients(
     lowest = least
     active = least > goal
     iterations = torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
-    p, rho, error = torch.zeros_like(b), torch.ones_like(goal), torch.zeros_like(goal)
+    p, rho = torch.zeros_like(b), torch.ones_like(goal)
     for _ in range(max_iter):
         if not bool(active.any()):
             break
         y = precondition(r)
-        if by_steps:
-            error = torch.where(active, _norm(y) / torch.where(_norm(x) > 0, _norm(x), 1), error)
-            active = active & ~((error <= tol) & (iterations > 0))
-            if not bool(active.any()):
-                break
         rho_new = _dot(r, y)
         p.mul_(_ratio(rho_new, rho, iterations > 0, p)).add_(y)  # in place: new memory costs as much as the arithmetic
         q = apply(p) if deflate is None else deflate(apply(p))
@@ -104,8 +96,7 @@ def conjugate_gradients(
     if bool(lost.any()):
         x = torch.where(_each(lost, x), best, x)
         final = torch.where(lost, least, final)
-    residual = error if by_steps else final / torch.where(scale > 0, scale, 1)
-    return CGResult(x, iterations, residual, ~active & ~lost)
+    return CGResult(x, iterations, final / torch.where(scale > 0, scale, 1), ~active & ~lost)
 
 
 def _each(systems: Tensor, like: Tensor) -> Tensor:

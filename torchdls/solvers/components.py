@@ -46,6 +46,12 @@ class Gauge(NamedTuple):
         """Maximum of x (N, H * W), at least 0, over the component of each pixel."""
         return torch.zeros_like(x).scatter_reduce(1, self.labels, x, "amax").gather(1, self.labels)
 
+    def greatest(self, x: Tensor) -> Tensor:
+        """Maximum of x (N, 1, H, W), at least 0, over each component; over all, (N, 1, 1, 1), without labels."""
+        if self.labels.shape[1]:
+            return self.maxima(x.flatten(1)).view_as(x)
+        return x.amax((1, 2, 3), keepdim=True)
+
     def mean(self, x: Tensor, weight: Tensor) -> Tensor:
         """Weighted mean of x (N, 1, H, W) over the component of each pixel; (N, 1, 1, 1), over all, without labels."""
         if self.labels.shape[1]:

@@ -2,10 +2,16 @@ r"""Direct solution of H z = b, H = A^T diag(w) A + diag(r), on any mask: nested
 
 The rectangle is halved along its longer side again and again; the line of pixels between two halves is the separator
 that the node of this tree owns, down to blocks of a few pixels. Pixels are eliminated from the leaves up. A node with
-own pixels E and border B (the pixels outside its rectangle that touch it) sees the dense front
+own pixels E and border B (the pixels outside its rectangle that touch it) sees a dense front of weights c_ij between
+its pixels, and c_i0 to the ground, the anchor. As a star of resistors becomes a mesh, a pixel p goes by
 
-        [ A_EE  A_EB ]     x_E = M b_E - G x_B          M = A_EE^{-1},  G = M A_EB
-        [ A_BE  A_BB ]     U = A_BB - A_BE G            what it hands to its parent
+        s_p = c_p0 + sum_j c_pj        l_pj = c_pj / s_p        c_ij <- c_ij + c_pi l_pj        c_i0 <- c_i0 + c_pi l_p0
+
+over the pixels i, j that are left: sums of positive numbers, so that every number of the factor is right to some units
+in the last place however far the weights are apart (the diagonal of H would have rounded the weak ones away). With
+T = (1 - l_EE)^{-1}, D = diag(s) and G = T l_EB, which are positive too,
+
+        x_E = T D^{-1} T^T b_E + G x_B        b_B <- b_B + G^T b_E
 
 Nodes of one level and of similar size are worked on together. The order of elimination depends on the mask alone and is
 kept for the next matrix on it. A batch of surfaces is a forest: nothing crosses from one to the other.
@@ -13,7 +19,8 @@ kept for the next matrix on it. A batch of surfaces is a forest: nothing crosses
 The work grows as n^1.5, the memory as n log n: 375 MB for 1024^2 pixels. All of it runs in float64.
 
 Source: George, "Nested dissection of a regular finite element mesh", 1973; Duff, Reid, "The multifrontal solution of
-indefinite sparse symmetric linear systems", 1983.
+indefinite sparse symmetric linear systems", 1983; Grassmann, Taksar, Heyman, "Regenerative analysis and steady state
+distributions for Markov chains", 1985, for elimination without differences.
 """
 
 from __future__ import annotations
@@ -30,7 +37,7 @@ from torchdls.operators import edge_ends
 
 _LEAF = 5  # longest side of a block that is not halved again
 _AT_ONCE = 2**18  # numbers of the fronts that are worked on together: they stay in the cache
-_SMALL = 12  # sides up to which an inverse is cheaper by elimination than by Cholesky's factor
+_AT_A_TIME = 16  # pivots that are eliminated one by one
 
 
 class Child(NamedTuple):
@@ -56,7 +63,7 @@ class Front(NamedTuple):
         own: (k, e) pixels that are eliminated here.
         border: (k, m) pixels that are left to the parents.
         idle: places in the flat (k, F, F) fronts, F = e + m, of pivots that stand for no pixel.
-        diagonal: places of the pivots, and their pixels.
+        diagonal: places of the others, and their pixels.
         edges: places of the edges that enter here, and their numbers in the flat (N, 2, H, W).
         children: what comes up from the level below.
     """
@@ -73,24 +80,24 @@ Levels = tuple[tuple[Front, ...], ...]  # the leaves first
 
 
 class Factor(NamedTuple):
-    """The factored matrix: M and G of every node."""
+    """The factored matrix: T, D and G of every node."""
 
     levels: Levels
-    blocks: list[list[tuple[Tensor, Tensor]]]
+    blocks: list[list[tuple[Tensor, Tensor, Tensor]]]
 
     def solve(self, b: Tensor) -> Tensor:
         """H^{-1} b (N, 1, H, W), in the dtype of b; 0 on pixels that are not alive."""
         x = torch.cat([b.flatten().double(), b.new_zeros(1, dtype=torch.float64)])
         inner = []
         for fronts, blocks in zip(self.levels, self.blocks, strict=True):
-            for front, (M, G) in zip(fronts, blocks, strict=True):
+            for front, (T, D, G) in zip(fronts, blocks, strict=True):
                 right = x[front.own][..., None]
-                inner.append((front, G, M @ right))
-                x.index_add_(0, front.border.flatten(), (G.mT @ right).flatten(), alpha=-1)
+                inner.append((front, G, T @ ((T.mT @ right) / D)))
+                x.index_add_(0, front.border.flatten(), (G.mT @ right).flatten())
             x[-1] = 0
         z = torch.zeros_like(x)
         for front, G, own in reversed(inner):
-            z[front.own.flatten()] = (own - G @ z[front.border][..., None]).flatten()
+            z[front.own.flatten()] = (own + G @ z[front.border][..., None]).flatten()
             z[-1] = 0
         return z[:-1].view(b.shape).to(b.dtype)
 
@@ -104,60 +111,71 @@ def factor(w: Tensor, r: Tensor, pixel_size: tuple[float, float] = (1.0, 1.0)) -
         pixel_size: (dx, dy).
     """
     steps = torch.tensor(pixel_size, dtype=torch.float64, device=w.device).view(1, 2, 1, 1)
-    w = w.double() / steps.square()
-    diagonal = edge_ends(w) + r.double()
-    levels = elimination((diagonal > 0)[:, 0])
-    off, diagonal = w.flatten(), diagonal.flatten()
-    blocks: list[list[tuple[Tensor, Tensor]]] = []
+    w, r = w.double() / steps.square(), r.double()
+    levels = elimination((edge_ends(w) + r > 0)[:, 0])
+    edges, ground = w.flatten(), r.flatten()
+    blocks: list[list[tuple[Tensor, Tensor, Tensor]]] = []
     below: list[Tensor] = []
     for fronts in levels:
         here, up = [], []
         for front in fronts:
-            M, G, U = _eliminate(_assemble(front, below, diagonal, off), front.own.shape[1])
-            here.append((M, G))
+            T, D, G, U = _eliminate(_assemble(front, below, edges, ground), front.own.shape[1])
+            here.append((T, D, G))
             up.append(U)
         blocks.append(here)
         below = up
     return Factor(levels, blocks)
 
 
-def _assemble(front: Front, below: list[Tensor], diagonal: Tensor, off: Tensor) -> Tensor:
-    """(k, F, F): what the children hand up, and the entries of H that enter here."""
+def _assemble(front: Front, below: list[Tensor], edges: Tensor, ground: Tensor) -> Tensor:
+    """(k, F, F): what the children hand up, and the weights of edges and anchors that enter here."""
     k, side = len(front.own), front.own.shape[1] + front.border.shape[1]
-    A = diagonal.new_zeros(k, side, side)
+    C = edges.new_zeros(k, side, side)
     for child in front.children:
         U = pad(below[child.front][child.rows], (0, 1, 0, 1))
         count, m = U.shape[:2]
         rows = (child.places + m * torch.arange(count, device=U.device)[:, None]).flatten()
         # U is symmetric: its rows are chosen, and after a transposition its columns.
         half = U.reshape(count * m, m).index_select(0, rows).view(count, side, m).mT.reshape(count * m, side)
-        A.index_add_(0, child.parents, half.index_select(0, rows).view(count, side, side))
-    flat = A.view(-1)
+        C.index_add_(0, child.parents, half.index_select(0, rows).view(count, side, side))
+    flat = C.view(-1)
     flat[front.idle] = 1
-    flat.index_add_(0, front.diagonal[0], diagonal[front.diagonal[1]])
-    flat.index_add_(0, front.edges[0], off[front.edges[1]], alpha=-1)
-    return A
+    flat.index_add_(0, front.diagonal[0], ground[front.diagonal[1]])
+    flat.index_add_(0, front.edges[0], edges[front.edges[1]])
+    return C
 
 
-def _eliminate(A: Tensor, e: int) -> tuple[Tensor, Tensor, Tensor]:
-    """M, G and U of the fronts (k, F, F), whose first e pixels go."""
-    own, across = A[:, :e, :e], A[:, :e, e:]
-    s = own.diagonal(dim1=1, dim2=2).clamp(min=torch.finfo(A.dtype).tiny).rsqrt()
-    scaled = own * s[:, :, None] * s[:, None, :]
-    M = _inverse(scaled).mul_(s[:, :, None]).mul_(s[:, None, :])
-    G = M @ across
-    return M, G, torch.baddbmm(A[:, e:, e:], across.mT, G, alpha=-1)
+def _eliminate(C: Tensor, e: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """T, D, G and U of the fronts (k, F, F), whose first e pixels go."""
+    ground = C.diagonal(dim1=1, dim2=2)
+    L, total = C.new_empty(len(C), e, C.shape[1] + 1), C.new_empty(len(C), e, 1)
+    L[..., :-1], L[..., -1] = C[:, :e], ground[:, :e]
+    _pivots(L, total, 0, e)
+    inner, border, held = L[..., :e].triu(1), L[..., e:-1], L[..., -1:]
+    T = torch.eye(e, dtype=L.dtype, device=L.device).expand_as(inner)
+    T = torch.linalg.solve_triangular(inner.neg_(), T, upper=True, unitriangular=True)
+    up = torch.baddbmm(C[:, e:, e:], border.mT, total * border)
+    up.diagonal(dim1=1, dim2=2).copy_(ground[:, e:] + (border.mT @ (total * held))[..., 0])
+    return T, total, T @ border, up
 
 
-def _inverse(scaled: Tensor) -> Tensor:
-    """Of symmetric matrices with a diagonal of ones; what rounding has made indefinite gets a ridge of rounding."""
-    if scaled.shape[1] <= _SMALL:
-        return torch.linalg.inv_ex(scaled).inverse
-    L, info = torch.linalg.cholesky_ex(scaled)
-    if bool(info.any()):
-        scaled.diagonal(dim1=1, dim2=2).add_(4 * scaled.shape[1] * torch.finfo(scaled.dtype).eps)
-        L = torch.linalg.cholesky_ex(scaled).L
-    return torch.cholesky_inverse(L)
+def _pivots(L: Tensor, total: Tensor, first: int, last: int) -> None:
+    """Eliminate rows first to last of L, (k, e, F + 1): what a pixel weighs to those after it, and to the ground.
+
+    They are left divided by their sums, the pivots `total`. Halves are joined by products of matrices.
+    """
+    if last - first > _AT_A_TIME:
+        middle = (first + last) // 2
+        _pivots(L, total, first, middle)
+        done = L[:, first:middle, middle:]
+        L[:, middle:last, middle:].baddbmm_(done[..., : last - middle].mT, total[:, first:middle] * done)
+        _pivots(L, total, middle, last)
+        return
+    for p in range(first, last):
+        row, near = L[:, p, p + 1 :], L[:, p, p + 1 : last, None].clone()
+        total[:, p] = row.sum(-1, keepdim=True).clamp(min=torch.finfo(L.dtype).tiny)
+        row.div_(total[:, p])
+        L[:, p + 1 : last, p + 1 :].addcmul_(near, row[:, None])
 
 
 def elimination(alive: Tensor) -> Levels:

@@ -9,17 +9,18 @@ from torch import Tensor
 
 from torchdls.operators import GradientOperator
 from torchdls.operators.edges import edge_ends
-from torchdls.solvers.cg import CGResult, LinearMap, conjugate_gradients
+from torchdls.solvers.cg import CGResult, LinearMap
 from torchdls.solvers.components import Gauge
 from torchdls.solvers.nested_dissection import factor
 
-# Steps of conjugate gradients with a direct factor at most.
-_DIRECT_STEPS = 30
+# Solves by a direct factor at most, and the change of heights that rounding leaves.
+_REFINEMENTS = 12
+_EXACT = 1e-13
+# Contrast of weights beyond which it is not to be trusted.
+_LOST = 1e30
 # Weights of edges (over squared steps) further apart than this let a residual swallow what the lighter ones say: they
 # take the direct factor, in double precision, which measures heights.
 STEEP = 1e4
-# What rounding may do to heights, by their size, where weights are so far apart.
-_ROUNDED = 1e-6
 # Anchors below this part of the weight of edges leave the constant of a component to rounding, unless it is set apart.
 WEAK = 1e-4
 
@@ -66,41 +67,102 @@ def normal(w: Tensor, r: Tensor, setting: Setting) -> LinearMap:
     return apply
 
 
-def directly(b: Tensor, w: Tensor, r: Tensor, x: Tensor, gauge: Gauge, setting: Setting) -> CGResult:
-    """The same, preconditioned by a direct factor and in double precision; one step mostly, three where H is singular.
+def directly(u: Tensor, pull: Tensor, w: Tensor, r: Tensor, gauge: Gauge, setting: Setting) -> tuple[CGResult, Tensor]:
+    """Minimiser of 1/2 w (A z - u)^2 + 1/2 r z^2 - pull z by a direct factor, in double precision; and u - A z.
 
-    In the factor alone, one pixel of every component that nothing else holds is held by as much as its edges weigh. The
-    error of the heights is measured by the factor, and what rounding did to b too: where that is more than `_ROUNDED`,
-    the system counts as not converged.
+    The factor is right at any contrast of weights, but forces A^T (w u) are not: what firm edges round away may be all
+    that weak ones say. So z is a sum of two numbers, whose misfits u - A z are taken edge by edge, and the forces of
+    what they leave pixel by pixel, without rounding in between; it is refined until one more solve changes no height by
+    more than `tol` of the largest of its component. Where weights of one component are more than `_LOST` apart, two
+    numbers do not suffice: the surface counts as not converged.
     """
-    dtype, gauge = b.dtype, gauge.double()
-    b, w, r, x = (t.double() for t in (b, w, r, x))
+    dtype, gauge = u.dtype, gauge.double()
+    u, pull, w, r = (t.double() for t in (u, pull, w, r))
+    solve, goal = _inverse(w, r, gauge, setting), max(setting.tol, _EXACT)
+    bent = gauge.balance(gauge.balance(pull))
+    some = gauge.greatest(bent.abs()) > _EXACT * gauge.greatest(pull.abs())  # the rest is rounding of nothing
+    pull = torch.where(some, bent, 0)
+    high = low = torch.zeros_like(r)
+    change = torch.full_like(r[:, 0, 0, 0], torch.inf)
+    active = torch.ones_like(change, dtype=torch.bool)
+    steps = torch.zeros_like(change, dtype=torch.int64)
+    for _ in range(_REFINEMENTS):
+        step = solve(_forces(w, misfit(u, high, low, setting), pull - r * high - r * low, setting))
+        active = active & step.isfinite().flatten(1).all(1)
+        step = torch.where(active.view(-1, 1, 1, 1), step, 0)
+        total, rest = _sum(high, low + step)
+        largest = gauge.greatest(total.abs())
+        now = (step.abs() / torch.where(largest > 0, largest, 1)).flatten(1).amax(1)
+        high, low, steps = total, rest, steps + active
+        change, active = torch.where(active, now, change), active & ~(now <= goal)
+        if not bool(active.any()):
+            break
+    m = misfit(u, high, low, setting)
+    found = (change <= goal) & (_contrast(w / squares(w, setting), gauge) <= _LOST)
+    change = torch.where(found, change, change.clamp(1.0, torch.finfo(dtype).max))
+    return CGResult(high.to(dtype), steps, change.to(dtype), found), m.to(dtype)
+
+
+def _contrast(w: Tensor, gauge: Gauge) -> Tensor:
+    """(N,) the largest ratio of two weights of edges of one component."""
+    least, most = 1 / torch.where(w > 0, w, torch.inf), w
+    ratio = gauge.greatest(least.amax(1, keepdim=True)) * gauge.greatest(most.amax(1, keepdim=True))
+    return ratio.flatten(1).amax(1)
+
+
+def _inverse(w: Tensor, r: Tensor, gauge: Gauge, setting: Setting) -> LinearMap:
+    """Forces to heights that are settled. One pixel of each component is held by as much as its edges weigh.
+
+    What this bends is given back: `lift` are the heights that the added weight asks for by itself.
+    """
+    if gauge.share.shape[1] == 0:
+        return factor(w, r, setting.pixel_size).solve
     edges = edge_ends(w / squares(w, setting))
-    held = r
-    if gauge.share.shape[1]:
-        loose = gauge.pins().view_as(r)
-        if gauge.pull.shape[1]:
-            loose = loose & (gauge.sums(r.flatten(1)).view_as(r) < WEAK * edges)
-        held = r + torch.where(loose, edges, 0)
-    direct = factor(w, held, setting.pixel_size)
-    apply, b = normal(w, r, setting), gauge.balance(b)
+    pins = torch.where(gauge.pins().view_as(r), torch.where(edges > 0, edges, r), 0)
+    direct = factor(w, r + pins, setting.pixel_size)
+    if gauge.labels.shape[1] == 0:
+        return lambda force: gauge.settle(direct.solve(gauge.balance(force)))
+    lift = direct.solve(pins).flatten(1)
+    whole = gauge.sums(lift * gauge.trust)
+    lift = lift / torch.where(whole > 0, whole, 1)
 
-    def solve(y: Tensor) -> Tensor:
-        return gauge.settle(direct.solve(y))
+    def solve(force: Tensor) -> Tensor:
+        x = direct.solve(gauge.balance(force)).flatten(1)
+        return (x - lift * gauge.sums(x * gauge.trust)).view_as(force)
 
-    found = conjugate_gradients(
-        apply, solve, b, x, tol=setting.tol, max_iter=_DIRECT_STEPS, project=gauge.correction(),
-        deflate=gauge.deflation(), by_steps=True,
-    )  # fmt: skip
-    rounded = solve(gauge.balance(_rounding(found.x, edges))).flatten(1).norm(dim=1)
-    rounded = rounded / found.x.flatten(1).norm(dim=1).clamp(min=torch.finfo(b.dtype).tiny)
-    lost = ~(rounded <= _ROUNDED)
-    residual = torch.where(lost, rounded, found.residual).nan_to_num(nan=torch.inf).clamp(max=torch.finfo(dtype).max)
-    return found._replace(x=found.x.to(dtype), residual=residual.to(dtype), converged=found.converged & ~lost)
+    return solve
 
 
-def _rounding(x: Tensor, edges: Tensor) -> Tensor:
-    """What rounding may have done to the pivots of H, as forces without a pattern, so that they do not cancel."""
-    k = torch.arange(1, x[0].numel() + 1, dtype=x.dtype, device=x.device)
-    size = 2 * torch.finfo(x.dtype).eps * x.abs().amax((1, 2, 3), keepdim=True)
-    return size * edges * k.square().sin().view(x[0].shape)
+def misfit(u: Tensor, high: Tensor, low: Tensor, setting: Setting) -> Tensor:
+    """u - A (high + low) (N, 2, H, W), rounded once."""
+    steps = squares(u, setting).sqrt()
+    m = u * steps
+    for channel, dim in ((0, -1), (1, -2)):
+        n = u.shape[dim] - 1
+        part = m.narrow(1, channel, 1).narrow(dim, 0, n)
+        rise, lost = _sum(high.narrow(dim, 1, n), -high.narrow(dim, 0, n))
+        left, more = _sum(part, -rise)
+        part.copy_(left + (more - lost - (low.narrow(dim, 1, n) - low.narrow(dim, 0, n))))
+    return m / steps
+
+
+def _forces(w: Tensor, m: Tensor, more: Tensor, setting: Setting) -> Tensor:
+    """A^T (w m) + more, rounded once: what leaves one end of an edge enters the other to the last digit."""
+    flow = w * m / squares(w, setting).sqrt()
+    total, lost = more.clone(), torch.zeros_like(more)
+    for channel, dim in ((0, -1), (1, -2)):
+        n = flow.shape[dim] - 1
+        part = flow.narrow(1, channel, 1).narrow(dim, 0, n)
+        for end, sign in ((0, -1), (1, 1)):
+            pixel, rest = total.narrow(dim, end, n), lost.narrow(dim, end, n)
+            now, left = _sum(pixel, sign * part)
+            pixel.copy_(now)
+            rest.add_(left)
+    return total + lost
+
+
+def _sum(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """a + b, and what rounding took from it (Knuth)."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)

@@ -89,9 +89,9 @@ def solve(
     Where w is None and r is one number per surface, H is diagonal in the cosine basis and the solve is direct.
     Otherwise conjugate gradients run, preconditioned by such a direct solve; where weights jump by so many orders that
     60 steps do not suffice, or they are more than 1e4 apart, a direct factor by nested dissection takes over (up to 4
-    million pixels; then `tol` is an error of heights, see docs/reliability.md). On a connected
-    component (of the edges with w > 0) that no anchor holds, the height has zero mean; pixels with neither edge nor
-    anchor are 0. No ridge is added.
+    million pixels; then `tol` is an error of heights, and weights may be 1e30 apart, see docs/reliability.md). On a
+    connected component (of the edges with w > 0) that no anchor holds, the height has zero mean; pixels with neither
+    edge nor anchor are 0. No ridge is added.
 
     Weights, anchors and slopes may have any scale: each component is solved in units of its own (powers of two, so
     nothing is rounded), less the plane that fits it best and the mean of its anchors. Neither firm anchors nor those
@@ -186,12 +186,11 @@ def _in_general(problem: Problem, setting: Setting) -> SolveResult:
     v, w, anchor, r, z0, pixel_size = problem
     setting = setting._replace(pixel_size=pixel_size)
     slope, level, lift, *found = _Levels.apply(v, w, anchor, r, setting)
-    force = slopes_of(setting).adjoint(w * (v - slope))
     if r is None:
-        r = pull = torch.zeros_like(force)
+        r = pull = torch.zeros_like(v[:, :1])
     else:
         pull = r * -level if anchor is None else r * (anchor - level)
-    z, *told = _Solve.apply(force, pull, w, r, None if z0 is None else z0 - level, *found, setting)
+    z, _, *told = _Solve.apply(v - slope, pull, w, r, None if z0 is None else z0 - level, *found, setting)
     return SolveResult((z + lift) * unit, *told)
 
 
@@ -286,16 +285,16 @@ class _Levels(torch.autograd.Function):
 
 
 class _Solve(torch.autograd.Function):
-    """z = H(w, r)^+ (f + s) by conjugate gradients, with the implicit derivative dz = H^+ (df + ds - dH z).
+    """z = H(w, r)^+ (A^T (w u) + s) and m = u - A z; implicitly dz = H^+ (A^T (w du + dw m) + ds - dr z).
 
-    The sum of f over a component is 0, as it comes from edges, and that of s where anchors hold a component: what s
-    asks of the constants is kept apart (`Gauge.constants`), as it may be larger than all the rest by many orders.
+    The sum of s is 0 over components that anchors hold: what asks for their constants is kept apart
+    (`Gauge.constants`), as it may be larger than all the rest by many orders.
     It runs in the window of the pixels that have an edge or an anchor, outside of which z = 0.
     """
 
     @staticmethod
     def forward(
-        f: Tensor,
+        u: Tensor,
         s: Tensor,
         w: Tensor,
         r: Tensor,
@@ -306,53 +305,53 @@ class _Solve(torch.autograd.Function):
         pull: Tensor,
         setting: Setting,
     ) -> tuple[Tensor, ...]:
-        z, size = torch.zeros_like(f), (f.shape[-2], f.shape[-1])
+        z, m, size = torch.zeros_like(s), u.clone(), (s.shape[-2], s.shape[-1])
         rows, columns = _slices(bounds)
         gauge = Gauge(labels, share, pull).window(rows, columns, size)
-        b, w, r = ((f + s)[..., rows, columns], w[..., rows, columns], r[..., rows, columns])
         z0 = None if z0 is None else z0[..., rows, columns]
-        x, iterations, residual, converged = _iterate(b, w, r, z0, gauge, setting)
+        u, s, w, r = (t[..., rows, columns] for t in (u, s, w, r))
+        (x, iterations, residual, converged), misfit = _iterate(u, s, w, r, z0, gauge, setting)
         if not bool(converged.all()):
             _warn(residual, converged, setting)
-        z[..., rows, columns] = x
-        return z, iterations, residual, converged
+        z[..., rows, columns], m[..., rows, columns] = x, misfit
+        return z, m, iterations, residual, converged
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
         _, _, w, r, _, *found, setting = inputs
-        z, *told = output
+        z, m, *told = output
         ctx.mark_non_differentiable(*told)
-        ctx.save_for_backward(z, w, r, *found)
-        ctx.save_for_forward(z, w, r, *found)
+        ctx.save_for_backward(z, m, w, r, *found)
+        ctx.save_for_forward(z, m, w, r, *found)
         ctx.setting = setting
 
     @staticmethod
     @full_precision
-    def backward(ctx: Any, dz: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        z, w, r, bounds, *gauge = ctx.saved_tensors
+    def backward(ctx: Any, dz: Tensor, dm: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        z, m, w, r, bounds, *gauge = ctx.saved_tensors
         constants = Gauge(*gauge).constants(dz, r)
-        bent = _Solve.apply(torch.zeros_like(dz), dz - r * constants, w, r, None, bounds, *gauge, ctx.setting)[0]
+        pull = dz - r * constants - slopes_of(ctx.setting).adjoint(dm)
+        bent, fall, *_ = _Solve.apply(torch.zeros_like(m), pull, w, r, None, bounds, *gauge, ctx.setting)
         adjoint = bent + constants
-        a = slopes_of(ctx.setting)
-        dw = -a(bent) * a(z) if ctx.needs_input_grad[2] else None
+        dw = -fall * m if ctx.needs_input_grad[2] else None
         dr = -adjoint * z if ctx.needs_input_grad[3] else None
-        return bent, adjoint, dw, dr, None, None, None, None, None, None
+        return dm - w * fall, adjoint, dw, dr, None, None, None, None, None, None
 
     @staticmethod
     def jvp(
-        ctx: Any, df: Tensor | None, ds: Tensor | None, dw: Tensor | None, dr: Tensor | None, *_: Any
+        ctx: Any, du: Tensor | None, ds: Tensor | None, dw: Tensor | None, dr: Tensor | None, *_: Any
     ) -> tuple[Tensor | None, ...]:
-        z, w, r, bounds, *gauge = ctx.saved_tensors
-        a = slopes_of(ctx.setting)
-        force = torch.zeros_like(z) if df is None else df
+        z, m, w, r, bounds, *gauge = ctx.saved_tensors
+        slope = torch.zeros_like(m) if du is None else du
         pull = torch.zeros_like(z) if ds is None else ds
-        if dw is not None:
-            force = force - a.adjoint(dw * a(z))
         if dr is not None:
             pull = pull - dr * z
         constants = Gauge(*gauge).constants(pull, r)
-        bent = _Solve.apply(force, pull - r * constants, w, r, None, bounds, *gauge, ctx.setting)[0]
-        return bent + constants, None, None, None
+        pull = pull - r * constants
+        if dw is not None:
+            pull = pull + slopes_of(ctx.setting).adjoint(dw * m)
+        bent, left, *_ = _Solve.apply(slope, pull, w, r, None, bounds, *gauge, ctx.setting)
+        return bent + constants, left, None, None, None
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
@@ -360,57 +359,74 @@ class _Solve(torch.autograd.Function):
         return tuple(x.unflatten(0, (info.batch_size, -1)) for x in outputs), (0,) * len(outputs)
 
 
-def _iterate(b: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, setting: Setting) -> CGResult:
-    """Conjugate gradients with the cosine preconditioner; with a direct factor where weights jump too much for that.
+def _iterate(
+    u: Tensor, s: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, setting: Setting
+) -> tuple[CGResult, Tensor]:
+    """Conjugate gradients with the cosine preconditioner; a direct factor where weights jump too much for that.
 
     The factor costs as much as `_PATIENCE` steps (measured from 128^2 to 512^2), so at worst half of the work is lost.
+    """
+    patience = _PATIENCE if s.numel() <= _LARGEST else setting.max_iter
+    apart = steep(w, setting) & (patience < setting.max_iter)
+    if bool(apart.all()):
+        return directly(u, s, w, r, gauge, setting)
+    found = _by_gradients(u, s, w, r, z0, gauge, setting._replace(max_iter=min(patience, setting.max_iter)), apart)
+    misfit = u - slopes_of(setting)(found.x)
+    if patience < setting.max_iter and not bool((found.converged & ~apart).all()):
+        rest = (apart | ~found.converged).nonzero()[:, 0]
+        other, their = directly(u[rest], s[rest], w[rest], r[rest], gauge.select(rest), setting)
+        found, misfit = found.replace(rest, other), misfit.index_copy(0, rest, their)
+    return found, misfit
+
+
+def _by_gradients(
+    u: Tensor, s: Tensor, w: Tensor, r: Tensor, z0: Tensor | None, gauge: Gauge, setting: Setting, apart: Tensor
+) -> CGResult:
+    """Preconditioned conjugate gradients, on the surfaces that are not `apart`.
+
     Anchors that are firm are met by the start, so that residuals are measured by what they leave open.
     """
+    b = slopes_of(setting).adjoint(w * u) + s
     b = gauge.balance(gauge.balance(b))  # again: a mean left by rounding lies outside the range of H
     if gauge.share.shape[1] == 0:  # every live pixel is held; the adjoint may ask for a height of the others too
         b = torch.where(edge_ends(w) + r > 0, b, 0)
-    unit = None
+    edges = edge_ends(w / squares(w, setting))
     if gauge.labels.shape[1]:
-        (b, w, r), unit = _normalize_components(b, w, r, gauge, setting)
-        z0 = None if z0 is None else z0 / unit
-    apply, start, edges = normal(w, r, setting), None, edge_ends(w / squares(w, setting))
+        trust = unit_of(gauge.greatest(torch.where(gauge.greatest(edges) > 0, edges, r)))
+        b, w, r, edges = (t / trust for t in (b, w, r, edges))
+    apply, start, unit = normal(w, r, setting), None, None
     firm = r > (edges if gauge.pull.shape[1] else _FIRM * edges)
     if gauge.pull.shape[1] or bool(firm.any()):
         start = torch.where(firm, b / torch.where(firm, edges + r, 1), 0)
         b = gauge.balance(b - apply(start))
         z0 = None if z0 is None else z0 - start
     z0 = None if z0 is None else gauge.settle(z0)  # what it says of free constants is not for CG to mend
-    patience = _PATIENCE if b[0].numel() * b.shape[0] <= _LARGEST else setting.max_iter
-    apart = steep(w, setting) & (patience < setting.max_iter)
+    if gauge.labels.shape[1]:
+        unit = _unit_of_components(b, gauge)
+        b, z0 = b / unit, None if z0 is None else z0 / unit
+    precondition = preconditioner(w, r, setting.pixel_size, weak=bool(gauge.pull.shape[1]))
     found = conjugate_gradients(
-        apply, preconditioner(w, r, setting.pixel_size, weak=bool(gauge.pull.shape[1])),
+        apply, (lambda b: gauge.settle(precondition(b))) if gauge.pull.shape[1] else precondition,
         torch.where(apart.view(-1, 1, 1, 1), 0, b) if bool(apart.any()) else b, z0,
-        tol=setting.tol, max_iter=min(patience, setting.max_iter), project=gauge.correction(),
+        tol=setting.tol, max_iter=setting.max_iter, project=gauge.correction(),
         deflate=gauge.deflation(),
     )  # fmt: skip
-    if patience < setting.max_iter and not bool((found.converged & ~apart).all()):
-        rest = (apart | ~found.converged).nonzero()[:, 0]
-        found = found.replace(rest, directly(b[rest], w[rest], r[rest], found.x[rest], gauge.select(rest), setting))
-    x = found.x if start is None else found.x + start
-    x = gauge.settle(x)
-    return found._replace(x=x if unit is None else x * unit)
+    x = found.x if unit is None else found.x * unit
+    if gauge.share.shape[1] == 0:  # weak anchors everywhere leave a constant that residuals hardly see
+        part, whole = (t.sum((-2, -1), keepdim=True, dtype=torch.double) for t in (b - r * x, r))
+        x = torch.where(edges + r > 0, x + (part / torch.where(whole > 0, whole, 1)).to(x.dtype), 0)
+    return found._replace(x=gauge.settle(x if start is None else x + start))
 
 
-def _normalize_components(
-    b: Tensor, w: Tensor, r: Tensor, gauge: Gauge, setting: Setting
-) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
-    """Weights and residuals of order 1 on every component, and the unit (N, 1, H, W) of its heights.
+def _unit_of_components(b: Tensor, gauge: Gauge) -> Tensor:
+    """(N, 1, H, W): what brings the residuals b to a norm of order 1 on every component.
 
     Components do not touch, so each has a scale of its own; with one scale, the tolerance of the largest would swallow
     the others.
     """
-    stiffness = edge_ends(w / squares(w, setting)) + r
-    trust = unit_of(gauge.maxima(stiffness.flatten(1))).view_as(r)
-    w, r, b = w / trust, r / trust, b / trust
-    largest = unit_of(gauge.maxima(b.abs().flatten(1)))
-    norm = unit_of(gauge.sums((b.flatten(1) / largest).square()).sqrt())
-    unit = (largest * norm).view_as(b)
-    return (b / unit, w, r), unit
+    largest = unit_of(gauge.greatest(b.abs()))
+    norm = unit_of(gauge.sums((b / largest).square().flatten(1)).sqrt())
+    return largest * norm.view_as(b)
 
 
 def _live_window(alive: Tensor) -> Tensor:
