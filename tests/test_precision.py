@@ -116,16 +116,18 @@ def test_inside_equals_outside(name):
     f, *tensors = CALLS[name]
     halves = [t.bfloat16() for t in tensors]
     results = []
-    for inside in (True, False):
+    for inside, backward in ((False, False), (True, False), (True, True)):
         leaves = [t.clone().requires_grad_() for t in tensors]
         with torch.autocast(_CAST, torch.bfloat16, enabled=inside):
             out = f(*(t.clone() for t in leaves))
-        if out.requires_grad:
-            (out * torch.linspace(-1, 1, out.numel()).view_as(out)).sum().backward()
+        with torch.autocast(_CAST, torch.bfloat16, enabled=backward):
+            if out.requires_grad:
+                (out * torch.linspace(-1, 1, out.numel()).view_as(out)).sum().backward()
         results.append([out.detach(), *(t.grad for t in leaves)])
-    for a, b in zip(*results, strict=True):
-        assert (a is None) == (b is None)
-        assert a is None or (a.dtype == b.dtype and torch.equal(a, b))
+    for within in results[1:]:
+        for a, b in zip(results[0], within, strict=True):
+            assert (a is None) == (b is None)
+            assert a is None or (a.dtype == b.dtype and torch.equal(a, b))
     with torch.autocast(_CAST, torch.bfloat16):
         taken = f(*halves)
     expected = f(*(t.float() for t in halves))

@@ -16,26 +16,57 @@ def autocast(dtype=torch.bfloat16):
     return torch.autocast(torch.empty(0).device.type, dtype=dtype)
 
 
-def height_and_slopes(integrator, g, optional, inside, solve=False):
+def height_and_slopes(integrator, g, optional, inside, solve=False, backward=False):
     """The height, and the derivative of a fixed functional of it in every floating-point argument."""
     leaf = g.clone().requires_grad_()
     leaves = {k: v.clone().requires_grad_(v.is_floating_point()) for k, v in optional.items()}
     with autocast() if inside else torch.enable_grad():
         z = integrator.solve(leaf, **leaves).height if solve else integrator(leaf, **leaves)
-    (z * random_field(*z.shape, seed=9, dtype=torch.float32)).sum().backward()
+        if backward:
+            (z * random_field(*z.shape, seed=9, dtype=torch.float32)).sum().backward()
+    if not backward:
+        (z * random_field(*z.shape, seed=9, dtype=torch.float32)).sum().backward()
     return [z.detach(), *(t.grad for t in (leaf, *leaves.values()) if t.is_floating_point())]
 
 
 @pytest.mark.parametrize("arguments", ["gradient", "everything"])
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_result_and_derivative_are_those_without(name, arguments):
+    """Whether the backward pass is called inside as well or, as it should be, outside."""
     integrator, g = method(name).build(name), bumps(2).float()
     optional = everything(integrator, g) if arguments == "everything" else {}
     for solve in (False, True):
-        within, without = (height_and_slopes(integrator, g, optional, inside, solve) for inside in (True, False))
-        for a, b in zip(within, without, strict=True):
-            assert a.dtype == torch.float32
-            assert torch.equal(a, b)
+        without = height_and_slopes(integrator, g, optional, False, solve)
+        for backward in (False, True):
+            within = height_and_slopes(integrator, g, optional, True, solve, backward)
+            for a, b in zip(within, without, strict=True):
+                assert a.dtype == torch.float32
+                assert torch.equal(a, b)
+
+
+def test_what_stands_before_and_behind_keeps_its_autocast():
+    """A backward pass inside is switched to full precision within the integrator, and nowhere else."""
+
+    class Look(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, x):
+            return x.clone()
+
+        @staticmethod
+        def backward(ctx, g):
+            seen.append(torch.is_autocast_enabled(torch.empty(0).device.type))
+            return g
+
+    class Within(torchdls.LeastSquares):
+        def _integrate(self, fields):
+            return Look.apply(super()._integrate(fields))
+
+    seen: list[bool] = []
+    leaf = bumps(1).float().requires_grad_()
+    with autocast():
+        Look.apply(Within()(Look.apply(leaf))).sum().backward()
+        assert torch.is_autocast_enabled(torch.empty(0).device.type)
+    assert seen == [True, False, True]
 
 
 @pytest.mark.parametrize("dtype", HALVES)
@@ -63,9 +94,11 @@ def test_half_precision_is_taken_up(name, dtype):
 @pytest.mark.filterwarnings("ignore::torchdls.ConvergenceWarning")  # of a NaN, see below
 def test_each_form_of_dls(options):
     integrator, g = torchdls.DLS(4, 2, 16, mu=0.3, n_iter=2, tol=0.0, **options), bumps(2).float()
-    within, without = (height_and_slopes(integrator, g, {}, inside) for inside in (True, False))
-    for a, b in zip(within, without, strict=True):  # the derivative of an orthonormal dictionary may be NaN
-        torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=options.get("learner") == "unitary")
+    without = height_and_slopes(integrator, g, {}, False)
+    for backward in (False, True):
+        within = height_and_slopes(integrator, g, {}, True, backward=backward)
+        for a, b in zip(within, without, strict=True):  # the derivative of an orthonormal dictionary may be NaN
+            torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=options.get("learner") == "unitary")
 
 
 def test_backward_of_a_solve_inside_autocast():
@@ -118,9 +151,16 @@ def test_compiled_inside_autocast(integrator):
 
 
 def test_vmap_inside_autocast():
-    g, long = bumps(3, 9, 8).float(), bumps(1, 140, 9).float()  # small ones are products, whose backward is PyTorch's
+    g, long = bumps(3, 9, 8).float(), bumps(1, 140, 9).float()
+    least = torchdls.LeastSquares()
+    slopes = [
+        torch.func.grad(lambda x: least(x).square().sum()),
+        torch.func.vmap(torch.func.grad(lambda x: least(x).square().sum())),
+        torch.func.grad(lambda x: torch.func.vmap(least)(x).square().sum()),
+    ]
     with autocast():
-        z = torch.func.vmap(torchdls.LeastSquares())(g.bfloat16())
-        slope = torch.func.grad(lambda x: torchdls.LeastSquares()(x).square().sum())(long)
-    torch.testing.assert_close(z, torchdls.LeastSquares()(g.bfloat16().float()))
-    torch.testing.assert_close(slope, torch.func.grad(lambda x: torchdls.LeastSquares()(x).square().sum())(long))
+        z = torch.func.vmap(least)(g.bfloat16())
+        within = [slopes[0](long), *(f(g) for f in slopes)]
+    torch.testing.assert_close(z, least(g.bfloat16().float()))
+    for a, b in zip(within, [slopes[0](long), *(f(g) for f in slopes)], strict=True):
+        torch.testing.assert_close(a, b)
