@@ -1,6 +1,7 @@
 """The public names and where they live: the one list, for `import torchdls` (see `__init__.py`) and type checkers."""
 
 from . import large as large
+from ._compiled import backends as backends
 from .anchors import CoarseFit as CoarseFit
 from .anchors import fit_coarse as fit_coarse
 from .anchors import place_pieces as place_pieces
@@ -14,7 +15,6 @@ from .dictionary import Focuss as Focuss
 from .dictionary import Learner as Learner
 from .dictionary import SoupDIL as SoupDIL
 from .dictionary import Unitary as Unitary
-from .dictionary import backends as backends
 from .dictionary import dct_dictionary as dct_dictionary
 from .dictionary import denoise_height as denoise_height
 from .dictionary import orthogonal_matching_pursuit as orthogonal_matching_pursuit

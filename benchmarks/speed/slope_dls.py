@@ -19,8 +19,7 @@ from torch import Tensor
 from benchmarks.common.report import made_by, markdown_table, results_folder, write_json
 from benchmarks.common.timing import fresh_process, peak_megabytes
 from benchmarks.speed.compare import noisy
-from torchdls import DLS, LeastSquares, SlopeDLS
-from torchdls.dictionary import sweep_fused
+from torchdls import DLS, LeastSquares, SlopeDLS, _compiled
 
 SHARE = 0.13  # of the image: the disk of the mask
 
@@ -43,7 +42,7 @@ def least(candidates: dict[str, Callable[[], Any]], turns: int) -> dict[str, flo
 
 
 def _alone(run: Callable[[], Any]) -> None:
-    with patch.object(sweep_fused, "installed", lambda: False):
+    with patch.object(_compiled, "installed", lambda: False):
         run()
 
 

@@ -22,8 +22,7 @@ from benchmarks.common.peers import ScipyPoisson, optional
 from benchmarks.common.report import made_by, markdown_table, results_folder, write_json
 from benchmarks.common.timing import interleaved
 from benchmarks.speed.compare import noisy
-from torchdls import DLS, LeastSquares, SoupDIL, backends, soup_dil_sweep
-from torchdls.dictionary import sweep_fused
+from torchdls import DLS, LeastSquares, SoupDIL, _compiled, backends, soup_dil_sweep
 from torchdls.dictionary.soup_dil import Order, residual_sweep
 from torchdls.solvers import integrate_direct
 
@@ -76,7 +75,7 @@ def sweep(size: int, order: Order, seconds: float) -> dict[str, Any]:
 
 def _alone(sweep: Callable[..., Any], *args: Any, **options: Any) -> Any:
     """By PyTorch alone."""
-    with patch.object(sweep_fused, "installed", lambda: False):
+    with patch.object(_compiled, "installed", lambda: False):
         return sweep(*args, **options)
 
 

@@ -1,19 +1,19 @@
 import pytest
 
-from torchdls import backends
-from torchdls.dictionary import soup_dil, sweep_chunks, sweep_fused
+from torchdls import _compiled, backends
+from torchdls.dictionary import soup_dil, sweep_chunks
 
 
 @pytest.fixture(params=["torch", "chunks", "numba"])
 def sweep_by(request, monkeypatch):
     """The sweep by PyTorch, of a batch together and of surfaces one by one in small chunks; and by compiled loops."""
     if request.param == "numba":
-        if not sweep_fused.installed():
+        if not _compiled.installed():
             pytest.skip("Numba is not installed (the extra `fast`)")
-        assert backends() == {"soup_dil_sweep": "numba"}
+        assert backends()["soup_dil_sweep"] == "numba"
         return
-    monkeypatch.setattr(sweep_fused, "installed", lambda: False)
-    assert backends() == {"soup_dil_sweep": "torch"}
+    monkeypatch.setattr(_compiled, "installed", lambda: False)
+    assert backends()["soup_dil_sweep"] == "torch"
     if request.param == "chunks":
         monkeypatch.setattr(soup_dil, "_SHORTEST", 1)
         monkeypatch.setattr(sweep_chunks, "_CHUNK", 7)

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from tests.helpers import random_field
-from torchdls import backends, soup_dil_sweep
+from torchdls import _compiled, backends, soup_dil_sweep
 from torchdls.dictionary import sweep_fused
 from torchdls.dictionary.soup_dil import residual_sweep
 
-pytestmark = pytest.mark.skipif(not sweep_fused.installed(), reason="Numba is not installed (the extra `fast`)")
+pytestmark = pytest.mark.skipif(not _compiled.installed(), reason="Numba is not installed (the extra `fast`)")
 orders = pytest.mark.parametrize("order", ["atom", "block"])
 
 
@@ -23,8 +23,8 @@ def problem(N=2, n=6, K=19, L=40):
 
 def by_pytorch(monkeypatch, R, D, B, *args, **options):
     with monkeypatch.context() as alone:
-        alone.setattr(sweep_fused, "installed", lambda: False)
-        assert backends() == {"soup_dil_sweep": "torch"}
+        alone.setattr(_compiled, "installed", lambda: False)
+        assert backends() == {"soup_dil_sweep": "torch", "SlopeDLS": "torch"}
         return residual_sweep(R.clone(), D, B.clone(), *args, **options)
 
 

@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from torchdls import DLS, SURFACES, LeastSquares, Patches, SoupDIL
-from torchdls.dictionary import sweep_fused
+from torchdls import DLS, SURFACES, LeastSquares, Patches, SoupDIL, _compiled
 from torchdls.dictionary.soup_dil import residual_sweep
 
 VIEWS = {"view", "slice", "select", "transpose", "expand", "unsqueeze", "as_strided", "detach", "split", "alias", "t"}
@@ -46,7 +45,7 @@ def codes_of(order):
 @pytest.mark.parametrize("order, total", [("block", 1000), ("atom", 2400)])
 def test_sweep(order, total, monkeypatch):
     """A few operations for every atom, on its row alone; the residual is met once or twice for every group."""
-    monkeypatch.setattr(sweep_fused, "installed", lambda: False)
+    monkeypatch.setattr(_compiled, "installed", lambda: False)
     R, D, B = codes_of(order)
     with Operations(large=R.numel()) as seen:
         residual_sweep(R, D, B, 0.2, order=order)
@@ -101,7 +100,7 @@ def test_an_iteration_of_the_masked_solve():
 
 @pytest.mark.parametrize("order", ["block", "atom"])
 def test_a_batch_of_small_surfaces_is_not_swept_one_by_one(order, monkeypatch):
-    monkeypatch.setattr(sweep_fused, "installed", lambda: False)
+    monkeypatch.setattr(_compiled, "installed", lambda: False)
     counts = []
     for n in (2, 8):
         g = noisy(40).expand(n, -1, -1, -1)

@@ -7,7 +7,6 @@ from torchdls.dictionary.initial import dct_dictionary
 from torchdls.dictionary.learners import KSVD, DinoKat, FixedDictionary, Learner, SoupDIL
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import soup_dil_sweep
-from torchdls.dictionary.sweep_fused import backends
 from torchdls.dictionary.tiles import TiledSweep, learn_over_tiles, over_ranks
 from torchdls.dictionary.unitary import Unitary
 
@@ -21,7 +20,6 @@ __all__ = [
     "SoupDIL",
     "TiledSweep",
     "Unitary",
-    "backends",
     "dct_dictionary",
     "denoise_height",
     "learn_over_tiles",

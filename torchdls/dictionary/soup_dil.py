@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdls import _compiled
 from torchdls._checks import check_alike, check_real
 from torchdls._precision import full_precision
 from torchdls._tracing import is_recorded
@@ -121,7 +122,7 @@ def _swept(
     """The sweep by whoever does it fastest; with `patches`, R is P, and neither it nor B is written to."""
     mu, by_atom = rule.mu, order == "atom" and learn
     in_place = not is_recorded(R, D, B, *([mu] if isinstance(mu, Tensor) else []))
-    if in_place and rule.project is None and sweep_fused.serves(R):
+    if in_place and rule.project is None and _compiled.serves(R):
         options = {"keep": rule.unused == "keep", "atom_order": by_atom, "learn": learn, "patches": patches}
         return sweep_fused.sweep(R, D, B, rule.cuts(B), rule.bound, rule.threshold, **options)
     rule = rule._replace(levels=_levels(mu, B, in_place), in_place=in_place)

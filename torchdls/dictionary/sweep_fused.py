@@ -9,46 +9,18 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from importlib.util import find_spec
+from collections.abc import Iterator
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchdls._compiled import Workers
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold
 
 _CHUNK = 2048  # patches of one thread that are worked on at a time: they stay in the cache
 _GROUP = 16  # atoms of the paper's order that share one product with the residual
-
-
-@functools.cache
-def installed() -> bool:
-    """Whether there is a Numba."""
-    return find_spec("numba") is not None
-
-
-def backends() -> dict[str, str]:
-    """What does the work where there is a choice, by the name of the function.
-
-    The compiled loops of the extra `fast` serve on the CPU where no derivative is recorded, by themselves; everywhere
-    else, and without Numba, PyTorch does.
-
-    Returns:
-        "numba" or "torch" for `soup_dil_sweep`, and so for `DLS`.
-
-    Example:
-        >>> torchdls.backends()["soup_dil_sweep"] in ("numba", "torch")
-        True
-    """
-    return {"soup_dil_sweep": "numba" if installed() else "torch"}
-
-
-def serves(*tensors: Tensor) -> bool:
-    """Whether the loops can be had for tensors that are not recorded."""
-    return installed() and all(t.device.type == "cpu" for t in tensors)
 
 
 def _loops() -> ModuleType:
@@ -133,15 +105,15 @@ def _block_order(R: Tensor, D: Tensor, codes: Tensor, cut: Tensor, how: _How) ->
         loops.update_codes(*given, moves, level, how.bound, how.rule, h.numpy(), c.numpy())
         return h, c
 
-    with _Workers() as workers:
+    with Workers() as workers:
         for i, part in _chunks(R, length):
             r, b = R[i, part], codes[i, part]
             if how.patches:
                 r = room[: len(r)].copy_(r)
-                workers(lambda x, c: loops.subtract(x.numpy(), c.numpy(), atoms.numpy()), r, b)
+                workers.split(lambda x, c: loops.subtract(x.numpy(), c.numpy(), atoms.numpy()), r, b)
             q = torch.mm(r, D, out=Q[: len(r)])
             level = cut[i].numpy()
-            for h, c in workers(functools.partial(update, level), r, q, b, used[i, part], counts[i, part]):
+            for h, c in workers.split(functools.partial(update, level), r, q, b, used[i, part], counts[i, part]):
                 H += h
                 C += c
         if not how.learn:
@@ -154,7 +126,7 @@ def _block_order(R: Tensor, D: Tensor, codes: Tensor, cut: Tensor, how: _How) ->
             loops.subtract_used(r.numpy(), b.numpy(), u.view(-1).numpy(), many.numpy(), step)
 
         for i, part in () if how.patches else _chunks(R, length):
-            workers(follow, *(x[i, part] for x in (R, codes, used, counts)))
+            workers.split(follow, *(x[i, part] for x in (R, codes, used, counts)))
     return new.mT
 
 
@@ -177,24 +149,3 @@ def _atom_order(R: Tensor, D: Tensor, codes: Tensor, cut: Tensor, how: _How) -> 
 def _chunks(R: Tensor, length: int) -> Iterator[tuple[int, slice]]:
     """Surface and patches, as many as all threads take at a time."""
     return ((i, slice(k, k + length)) for i in range(R.shape[0]) for k in range(0, R.shape[1], length))
-
-
-class _Workers:
-    """Calls a function for parts of some tensors at the same time, on as many threads as PyTorch may use."""
-
-    def __init__(self) -> None:
-        self._count = torch.get_num_threads()
-        self._pool = ThreadPoolExecutor(self._count) if self._count > 1 else None
-
-    def __enter__(self) -> _Workers:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown()
-
-    def __call__(self, f: Callable[..., Any], *tensors: Tensor) -> list[Any]:
-        if self._pool is None:
-            return [f(*tensors)]
-        step = -(-len(tensors[0]) // self._count)
-        return list(self._pool.map(f, *(x.split(step) for x in tensors)))

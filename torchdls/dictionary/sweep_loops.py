@@ -6,25 +6,14 @@ change, so all but one dense product, which is left to PyTorch, runs over these 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
-from numba import njit
+
+from torchdls._compiled import compiled
 
 _EXACT = 256  # terms that are summed in the dtype of the patches, before double precision takes over
 
 
-def _compiled(f: Callable[..., Any]) -> Any:
-    """Compiled on the first call; kept on disk where Numba finds a place to write."""
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
-    try:
-        return njit(f, cache=True, **options)
-    except RuntimeError:  # nowhere to write
-        return njit(f, **options)
-
-
-@_compiled
+@compiled
 def _shrunk(x, cut, bound, rule):
     """`thresholds.shrink` of one number; rule 0 is "hard", 1 "soft", 2 "firm"."""
     if not abs(x) > cut:
@@ -37,7 +26,7 @@ def _shrunk(x, cut, bound, rule):
     return min(max(b, -bound), bound)
 
 
-@_compiled
+@compiled
 def subtract(R, codes, atoms):
     """R -= D b for patches (L, n) and their codes (L, K)."""
     for i in range(R.shape[0]):
@@ -48,7 +37,7 @@ def subtract(R, codes, atoms):
                     R[i, p] -= b * atoms[k, p]
 
 
-@_compiled
+@compiled
 def subtract_used(R, codes, used, counts, atoms):
     """The same from the lists that `update_codes` leaves."""
     at = 0
@@ -61,7 +50,7 @@ def subtract_used(R, codes, used, counts, atoms):
         at += counts[i]
 
 
-@_compiled
+@compiled
 def update_codes(R, Q, codes, used, counts, moves, cut, bound, rule, H, C):
     """All codes of some patches with the atoms held fixed.
 
@@ -102,7 +91,7 @@ def update_codes(R, Q, codes, used, counts, moves, cut, bound, rule, H, C):
         at += m
 
 
-@_compiled
+@compiled
 def _as_atom(h, old, keep, new):
     """h / ||h|| into `new`; where h = 0, the atom of before or the first unit vector."""
     square = 0.0
@@ -117,7 +106,7 @@ def _as_atom(h, old, keep, new):
             new[p] = old[p] if keep else p == 0
 
 
-@_compiled
+@compiled
 def update_atoms(H, C, atoms, keep, new):
     """All atoms (K, n) with the codes held fixed, from H and C, into `new`; H is overwritten."""
     K, n = atoms.shape
@@ -132,7 +121,7 @@ def update_atoms(H, C, atoms, keep, new):
                     H[j, p] -= (new[k, p] - atoms[k, p]) * C[k, j]
 
 
-@_compiled
+@compiled
 def update_group(R, Q, B, atoms, start, cut, bound, rule, keep, new, where, before, after):
     """Row, atom, row, atom, .. of a group of atoms from `start` on.
 

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 from tests.helpers import DISK, random_field, seeded
 from torchdls import SURFACES, LeastSquares, SlopeDLS, add_noise, rmse, ssim
-from torchdls.integrators.slope_dls.bases import Places
+from torchdls.integrators.slope_dls.bases import PatchNoise, Places
 from torchdls.integrators.slope_dls.blend import blend_by_waves, least_in_simplex, signs, sure_weights
 from torchdls.integrators.slope_dls.holed import _around
 from torchdls.integrators.slope_dls.known import Known
@@ -333,8 +333,8 @@ def test_patches_of_a_window_are_those_of_the_whole(size, offset):
     places, known = Places((70, 160), size, offset), Known(valid, None)
     noise = torch.full((2, 1, 1, 1), 0.8, dtype=torch.float64)
     found = HOLED[0]._code(places, slopes, noise, STEPS, known)
-    far = places.far_noise(slopes, STEPS)
-    whole = HOLED[0]._code_patches(places, slopes, noise, lambda _: far, known.weight(places))
+    far = PatchNoise(places, STEPS, where="far")
+    whole = HOLED[0]._code_patches(places, slopes, noise, far, known.weight(places))
     torch.testing.assert_close(found.total, whole.total)
     torch.testing.assert_close(found.weight, whole.weight)
     assert (found.weight == 0).any() or size == 64

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -164,10 +165,52 @@ class Places:
         return found
 
 
-@table
-def _far_noise(size: int, smooth: bool, steps: tuple[float, float]) -> Tensor:
+@dataclass(frozen=True)
+class PatchNoise:
+    """The noise of every coefficient of some patches.
+
+    Args:
+        places: the patches, on the torus or in the image; far from every border their number is of no account.
+        steps: (dx, dy).
+        turned: for the slopes along the diagonals; not far from every border.
+        where: "here" (`Places.noise`), "far" (`Places.far_noise`) or "torus" (`Places.torus_noise`).
+    """
+
+    places: Places
+    steps: tuple[float, float]
+    turned: bool = False
+    where: Literal["here", "far", "torus"] = "here"
+
+    def of(self, strips: slice, like: Tensor) -> Tensor:
+        """(size, 1, 2, 1 or rows of patches, 1 or columns, size) of these strips."""
+        if self.where == "far":
+            return self.places.far_noise(like, self.steps)
+        if self.where == "torus":
+            return self.places.torus_noise(like, self.steps, self.turned)
+        return self.places.noise(like, self.steps, self.turned, strips)
+
+    def shortened(self) -> PatchNoise:
+        """The same of a smaller image that lacks only patches in the middle, all with the same noise."""
+        if self.where == "torus":
+            return self
+        if self.where == "far":
+            return replace(self, places=Places((self.places.size,) * 2, self.places.size, 0, self.places.smooth))
+        rows, columns = (_less(line)[0] for line in self.places.lines)
+        return replace(self, places=replace(self.places, shape=(rows, columns)))
+
+    def build(self) -> Tensor:
+        """All of it in float64, not kept: (size, 1, 2, 1 or rows of patches, 1 or columns, size)."""
+        places, steps = self.places, self.steps
+        if self.where == "torus":
+            return _build_torus_noise(places.shape, places.size, places.smooth, steps, self.turned)
+        if self.where == "far":
+            return _build_far_noise(places.size, places.smooth, steps)
+        return _build_noise(places.shape, places.size, places.offsets, places.smooth, steps, self.turned)
+
+
+def _build_far_noise(size: int, smooth: bool, steps: tuple[float, float]) -> Tensor:
     middle = Places((4 * size, 4 * size), size, 0, smooth)
-    found = middle.noise(torch.empty(0, dtype=torch.float64, device="cpu"), steps)
+    found = _build_noise(middle.shape, size, middle.offsets, smooth, steps, False)
     row, column = (len(line.positions) // 2 for line in middle.lines)
     return found[..., row : row + 1, column : column + 1, :].contiguous()
 
@@ -214,8 +257,9 @@ def _by_patch(in_x: Tensor, in_y: Tensor, shared: Tensor | None, size: int) -> T
     return by_patch.movedim(2, 0)[:, None].contiguous()
 
 
-@table
-def _torus_noise(shape: tuple[int, int], size: int, smooth: bool, steps: tuple[float, float], turned: bool) -> Tensor:
+def _build_torus_noise(
+    shape: tuple[int, int], size: int, smooth: bool, steps: tuple[float, float], turned: bool
+) -> Tensor:
     double = torch.empty(0, dtype=torch.float64, device="cpu")
     variance, basis = height_noise(shape, double, steps, "periodic"), atoms(size, smooth, like=double)
     y, x = (torch.fft.fft(basis, n, norm="ortho").abs().square() for n in shape)
@@ -237,4 +281,4 @@ def _seen(line: Line, double: Tensor) -> tuple[Tensor, Tensor]:
     return value, slope
 
 
-_noise = table(_build_noise)
+_noise, _far_noise, _torus_noise = (table(build) for build in (_build_noise, _build_far_noise, _build_torus_noise))

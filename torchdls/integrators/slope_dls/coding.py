@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torchdls._tracing import is_recorded
 from torchdls.dictionary import dct_dictionary, soup_dil_sweep
 from torchdls.noise import cosine_noise, slope_covariance
 from torchdls.operators import Patches
@@ -139,6 +140,15 @@ class SlopeScale:
         """(N, 2n, 2n): cosines of the slopes in x and, separately, in y."""
         d = dct_dictionary(self.size, dtype=slopes.dtype, device=slopes.device)
         return torch.block_diag(d, d).expand(slopes.shape[0], -1, -1)
+
+
+def added(part: Coded, so_far: Coded | None) -> Coded:
+    """The sum of both, in the memory of the second where nothing is recorded."""
+    if so_far is None:
+        return part
+    if is_recorded(*part, *so_far) or so_far.weight.shape != part.total.shape:
+        return Coded(so_far.total + part.total, so_far.weight + part.weight)
+    return Coded(so_far.total.add_(part.total), so_far.weight.add_(part.weight))
 
 
 def average(parts: Sequence[Coded], otherwise: Tensor | None = None) -> Tensor:

@@ -148,14 +148,27 @@ def _positions(n: int, size: int, offset: int, stride: int) -> tuple[int, ...]:
 
 @table
 def atoms(size: int, smooth: bool) -> Tensor:
-    """(size, size) orthonormal rows: cosines, from 16 samples on after polynomials of degree 0 to 5 (Gram-Schmidt)."""
+    """(size, size) orthonormal rows: cosines, from 16 samples on after polynomials of degree 0 to 5 (Gram-Schmidt).
+
+    Every atom is even or odd about the middle, and Gram-Schmidt goes over the even and over the odd ones apart: from 32
+    samples on, both together would leave to rounding what the last atoms are, which the others all but span.
+    """
     cosines = cosine_matrix(size, like=torch.empty(0, dtype=torch.float64, device="cpu"))
     if not smooth or size < _SMOOTH_FROM:
         return cosines
     t = torch.linspace(-1, 1, size, dtype=torch.float64, device="cpu")
-    powers = torch.stack([t**k for k in range(_DEGREE + 1)])
-    q, r = torch.linalg.qr(torch.cat([powers, cosines[1 : size - _DEGREE]]).mT)
-    return (q * r.diagonal().sign()).mT.contiguous()
+    functions = torch.cat([torch.stack([t**k for k in range(_DEGREE + 1)]), cosines[1:]])
+    parity = torch.tensor([*(k % 2 for k in range(_DEGREE + 1)), *(k % 2 for k in range(1, size))], device="cpu")
+    found = torch.zeros_like(functions)
+    for odd in (0, 1):
+        half = (size + 1 - odd) // 2  # samples that are free; the middle one, if any, counts once
+        own, scale = (parity == odd).nonzero().flatten()[:half], t.new_full((half,), 2).sqrt()
+        scale[size // 2 :] = 1
+        q, r = torch.linalg.qr((functions[own, :half] * scale).mT)
+        left = (q * r.diagonal().sign()).mT / scale
+        found[own, :half] = left
+        found[own, size - half :] = left.flip(1) * (1 - 2 * odd)
+    return found[found.any(1)]
 
 
 def _inside(line: Line) -> Tensor:

@@ -12,9 +12,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchdls._tracing import is_concrete, is_recorded
-from torchdls.integrators.slope_dls.bases import Places
+from torchdls.integrators.slope_dls import strips_fused
+from torchdls.integrators.slope_dls.bases import PatchNoise, Places
 from torchdls.integrators.slope_dls.blend import blend_by_waves, signs
-from torchdls.integrators.slope_dls.coding import Coded, average
+from torchdls.integrators.slope_dls.coding import Coded, added, average
 from torchdls.integrators.slope_dls.known import Known
 from torchdls.integrators.slope_dls.waves import cautious, shrink_slow_waves
 from torchdls.operators import GradientOperator, edge_slopes
@@ -132,63 +133,68 @@ class Run:
         given, slopes = slopes, _turn(slopes) if self.turned else slopes
         found = None  # summed scale by scale: no more than one is held beside the sum
         for places in self.places(shape, iteration):
-            level = tau * noise[:, None, None, None]
+            level, so_far = tau * noise[:, None, None, None], None if self.turned else found
             if boundary == "periodic":
-                part = self._code_around(places, slopes, level, steps)
+                part = self._code_around(places, slopes, level, steps, so_far)
             else:
-                part = self._code(places, slopes, level, steps, known)
-            if self.turned:  # turning back mixes the two components, so they must share one weight
-                weight = part.weight.mean(1, keepdim=True)
-                part = Coded(_turn(part.total / part.weight) * weight, weight)
-            found = part if found is None else Coded(found.total + part.total, found.weight + part.weight)
+                part = self._code(places, slopes, level, steps, known, so_far)
+            found = _turned_back(part, found) if self.turned else part
         assert found is not None
         return average([found]) if known is None else average([found], given)
 
-    def _code_around(self, places: Places, slopes: Tensor, level: Tensor, steps: tuple[float, float]) -> Coded:
+    def _code_around(
+        self, places: Places, slopes: Tensor, level: Tensor, steps: tuple[float, float], so_far: Coded | None
+    ) -> Coded:
         """On a torus: laid out flat, so that patches find all their pixels, and folded back."""
         flat, *positions = places.around()
         rows, columns = (p.to(slopes.device) for p in positions)
-        noise = places.torus_noise(slopes, steps, self.turned)
-        coded = self._code_patches(
-            flat, slopes.index_select(-2, rows).index_select(-1, columns), level, lambda _: noise
-        )
+        noise = PatchNoise(places, steps, self.turned, "torus")
+        coded = self._code_patches(flat, slopes.index_select(-2, rows).index_select(-1, columns), level, noise)
 
         def folded(x: Tensor) -> Tensor:
             narrow = x.new_zeros(*x.shape[:-2], places.shape[0], x.shape[-1]).index_add(-2, rows, x)
             return narrow.new_zeros(*x.shape[:-2], *places.shape).index_add(-1, columns, narrow)
 
-        return Coded(*map(folded, coded))
+        return added(Coded(*map(folded, coded)), so_far)
 
     def _code(
-        self, places: Places, slopes: Tensor, level: Tensor, steps: tuple[float, float], known: Known | None
+        self,
+        places: Places,
+        slopes: Tensor,
+        level: Tensor,
+        steps: tuple[float, float],
+        known: Known | None,
+        so_far: Coded | None = None,
     ) -> Coded:
         if known is None:
-            return self._code_patches(
-                places, slopes, level, lambda rows: places.noise(slopes, steps, self.turned, rows)
-            )
-        far, trust, level = places.far_noise(slopes, steps), known.weight(places), level * known.level(places)
+            return self._code_patches(places, slopes, level, PatchNoise(places, steps, self.turned), None, so_far)
+        far, trust, level = PatchNoise(places, steps, where="far"), known.weight(places), level * known.level(places)
         if not is_concrete(trust):
-            return self._code_patches(places, slopes, level, lambda _: far, trust)
+            return self._code_patches(places, slopes, level, far, trust, so_far)
         part, (down, across), at = places.within((trust > 0).any(0).any(0))
         level = level[:, :, at[0], at[1]] if level[0, 0].numel() > 1 else level
-        coded = self._code_patches(part, slopes[..., down, across], level, lambda _: far, trust[:, :, at[0], at[1]])
+        coded = self._code_patches(part, slopes[..., down, across], level, far, trust[:, :, at[0], at[1]])
         (h, w), (top, left) = places.shape, (down.start, across.start)
-        return Coded(*(functional.pad(x, (left, w - across.stop, top, h - down.stop)) for x in coded))
+        padded = (functional.pad(x, (left, w - across.stop, top, h - down.stop)) for x in coded)
+        return added(Coded(*padded), so_far)
 
     def _code_patches(
         self,
         places: Places,
         slopes: Tensor,
         level: Tensor,
-        noise: Callable[[slice], Tensor],
+        noise: PatchNoise,
         trust: Tensor | None = None,
+        so_far: Coded | None = None,
     ) -> Coded:
+        if strips_fused.serves(places, *(x for x in (slopes, level, trust) if x is not None)):
+            return strips_fused.code(places, slopes, level, noise, trust, self.weights, so_far)
         strips, totals, weights = places.down(slopes), [], []
         for rows in places.strips(slopes.shape[0]):
             coefficients = places.across(strips[..., rows, :])
             own = level[:, :, rows] if level.shape[2] > 1 else level
             in_place = not is_recorded(coefficients, level)
-            kept = _above(coefficients, own[..., None], noise(rows), in_place)
+            kept = _above(coefficients, own[..., None], noise.of(rows, slopes), in_place)
             coefficients = coefficients.mul_(kept) if in_place else coefficients * kept
             weight = self._weight(places.size, kept, None if trust is None else trust[:, :, rows])
             if weight is not None:
@@ -197,7 +203,8 @@ class Run:
                 coefficients = coefficients.mul_(weight) if in_place else coefficients * weight
             totals.append(places.back_across(coefficients))
         total = places.back_down(torch.cat(totals, -2))
-        return Coded(total, places.spread(torch.cat(weights, 2)) if weights else places.coverage(slopes))
+        weight = places.spread(torch.cat(weights, 2)) if weights else places.coverage(slopes)
+        return added(Coded(total, weight), so_far)
 
     def _weight(self, size: int, kept: Tensor, trust: Tensor | None) -> Tensor | None:
         """(N, 2, rows, columns) of patches in the average; None for 1."""
@@ -300,6 +307,14 @@ def _blend(
         changes = (torch.stack(moved) - heights.detach()) / step
         pushed = grid.least_squares(n)
     return blend_by_waves(heights, changes, start, pushed, level, grid.steps, boundary=grid.boundary)
+
+
+def _turned_back(part: Coded, so_far: Coded | None) -> Coded:
+    """Sums along the diagonals as those in x and y, whose components, now mixed, share one weight."""
+    if strips_fused.installed_for(*part) and part.weight.shape == part.total.shape:
+        return strips_fused.turned_back(part, so_far)
+    weight = part.weight.mean(1, keepdim=True)
+    return added(Coded(_turn(part.total / part.weight) * weight, weight), so_far)
 
 
 def _turn(slopes: Tensor) -> Tensor:
