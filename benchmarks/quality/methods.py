@@ -21,6 +21,7 @@ from torchdls import (
     INTEGRATORS,
     SURFACES,
     AnisotropicDiffusion,
+    Integrator,
     MEstimator,
     MumfordShah,
     SlopeDLS,
@@ -32,7 +33,7 @@ SNR = 20
 # What is compared with: rows above all others.
 FIRST = ("least_squares", "l1", "slope_dls")
 # Forms that are not the default.
-FORMS = {
+FORMS: dict[str, Integrator] = {
     "slope_dls (robust)": SlopeDLS(robust=True),
     "m_estimator (joint)": MEstimator(joint=True),
     "anisotropic_diffusion (follow = field)": AnisotropicDiffusion(follow="field"),

@@ -61,12 +61,12 @@ def sequences(size: int, frames: int, seed: int) -> list[Row]:
     return rows
 
 
-def scattered(count: int, seed: int) -> list[Row]:
-    """sin(x) cos(y / 2) from slopes with noise of a tenth at random points; beside a grid of interpolated slopes."""
+def scattered(count: int, noise: float, seed: int) -> list[Row]:
+    """sin(x) cos(y / 2) from slopes at random points; beside least squares on a grid of interpolated slopes."""
     generator = torch.Generator().manual_seed(seed)
     x = 6 * torch.rand(count, 2, generator=generator, dtype=torch.float64)
     g = torch.stack([x[:, 0].cos() * (x[:, 1] / 2).cos(), -0.5 * x[:, 0].sin() * (x[:, 1] / 2).sin()], -1)
-    g = g + 0.1 * torch.randn(g.shape, generator=generator, dtype=torch.float64)
+    g = g + noise * torch.randn(g.shape, generator=generator, dtype=torch.float64)
     line = torch.linspace(0.5, 5.5, 41, dtype=torch.float64)
     at = torch.stack([t.flatten() for t in torch.meshgrid(line, line, indexing="xy")], -1)
     truth = (at[:, 0].sin() * (at[:, 1] / 2).cos()).numpy()
@@ -76,9 +76,9 @@ def scattered(count: int, seed: int) -> list[Row]:
     found = {
         "interpolated slopes, least squares": LeastSquares(pixel_size=5 / 40)(field).flatten(),
         "integrate_scattered": integrate_scattered(x, g, at),
-        "integrate_scattered(lam=1)": integrate_scattered(x, g, at, lam=1.0),
     }
-    return [(f"{count} scattered slopes", name, float(np.std(z.numpy() - truth))) for name, z in found.items()]
+    label = f"{count} scattered slopes, noise {noise:g}"
+    return [(label, name, float(np.std(z.numpy() - truth))) for name, z in found.items()]
 
 
 def heights(size: int, seed: int) -> list[Row]:
@@ -159,7 +159,8 @@ def main() -> None:
     total: dict[tuple[str, str], list[float]] = {}
     with torch.no_grad():
         for seed in range(FIRST_SEED, FIRST_SEED + seeds):
-            found = [*sequences(size, frames, seed), *scattered(count, seed), *heights(size, seed), *mesh(rings, seed)]
+            found = [*sequences(size, frames, seed), *heights(size, seed), *mesh(rings, seed)]
+            found += [row for n in (count // 4, count) for noise in (0.0, 0.1) for row in scattered(n, noise, seed)]
             for kind, name, error in found:
                 total.setdefault((kind, name), []).append(error)
     rows = [[*labels, sum(errors) / len(errors)] for labels, errors in total.items()]

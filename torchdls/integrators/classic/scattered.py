@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 
 from torchdls._checks import check_alike, check_real, require
 from torchdls._precision import full_precision
 
+Auto = Literal["auto"]
+
 
 @full_precision
 def integrate_scattered(
-    points: Tensor, slopes: Tensor, at: Tensor, *, sigma: float | None = None, lam: float = 1e-6
+    points: Tensor, slopes: Tensor, at: Tensor, *, sigma: float | None = None, lam: float | Auto = "auto"
 ) -> Tensor:
     r"""Heights from slopes at scattered points: a plane and a Gaussian bump on each point.
 
@@ -23,8 +27,15 @@ def integrate_scattered(
     M x M matrices in float64: time grows as M^3, memory as M^2. Between the points the surface is as smooth as the
     bumps, far from them it is the plane.
 
+    "auto" takes of fifteen lam from 1e-6 to 10 the one with the least generalised cross-validation
+
+        GCV(lam) = sum_i sigma^2 |grad z(x_i) - g_i|^2 / (2 M - 2 - degrees of freedom of a)^2
+
+    for each field of slopes: next to none without noise, under noise one near the best.
+
     K is all but singular for bumps that are wide beside the spacing of the points; its eigenvectors below 1e-13 of the
-    largest are left out. Differentiable in the slopes, in which it is linear; points are taken as fixed.
+    largest are left out. Differentiable in the slopes, in which it is linear once lam is chosen; points are taken as
+    fixed.
 
     Args:
         points: (M, 2) positions (x, y), in any unit; x to the right and y down, if they are those of pixels.
@@ -32,7 +43,7 @@ def integrate_scattered(
         at: (K, 2) positions at which the height is wanted.
         sigma: width of the bumps, in the unit of the points; None for twice the root of the area that a point has in
             the bounding box of all.
-        lam: weight of the penalty, positive; the larger, the more noise it takes out, and detail with it.
+        lam: weight of the penalty, positive, or "auto"; the larger, the more noise it takes out, and detail with it.
 
     Returns:
         (K,) or (N, K) heights in the unit of the points; their mean over the `points` is 0.
@@ -43,7 +54,8 @@ def integrate_scattered(
             line along x or y and `sigma` is not given.
 
     Source: after Ng, Wu, Tang, "Surface-from-gradients without discrete integrability enforcement: a Gaussian kernel
-    approach", IEEE TPAMI 32(11), 2010. Their penalty is not confirmed; the plane is ours.
+    approach", IEEE TPAMI 32(11), 2010. Their penalty is not confirmed; the plane is ours. Choice of
+    lam: Golub, Heath, Wahba, Technometrics 21, 1979.
 
     Example:
         >>> points = torch.rand(200, 2, generator=torch.Generator().manual_seed(0)).double() * 6
@@ -65,10 +77,24 @@ def integrate_scattered(
     V = V[:, live] * s[live].rsqrt()  # a = V c, a^T K a = |c|^2
     E = D @ V
     right = width * (g - mean).flatten(-2)
-    c = torch.linalg.solve(E.mT @ E + lam * torch.eye(E.shape[1]).to(E), E.mT @ right[..., None])
+    t, W = torch.linalg.eigh(E.mT @ E)
+    t, b = t.clamp(min=0), right @ E @ W
+    chosen = _choose(right.detach(), t, b.detach()) if isinstance(lam, str) else lam
     read = _bumps(y, x, width) - K.mean(0)
-    height = (read @ V @ c)[..., 0] + ((y - middle) * mean).sum(-1)
+    height = (b / (t + chosen)) @ (read @ V @ W).mT + ((y - middle) * mean).sum(-1)
     return height.to(slopes.dtype)
+
+
+def _choose(right: Tensor, t: Tensor, b: Tensor) -> Tensor:
+    """(.., 1), the lam of least generalised cross-validation, for eigenvalues t and their share b of the right side."""
+    lams = torch.logspace(-6, 1, 15, dtype=t.dtype, device=t.device)[:, None]
+    part = b[..., None, :] / (t + lams)  # (.., 15, M)
+    whole = right.square().sum(-1)[..., None]
+    misfit = whole - (part * (2 * b[..., None, :] - t * part)).sum(-1)
+    free = (right.shape[-1] - 2 - (t / (t + lams)).sum(-1)).clamp(min=0.5)
+    # What rounding leaves of a misfit of 0 is none: of equal ones the least lam is taken.
+    score = misfit.clamp(min=1e-12 * whole) / free.square()
+    return lams[score.argmin(-1)]
 
 
 def _bumps(x: Tensor, centres: Tensor, width: float) -> Tensor:
@@ -82,7 +108,7 @@ def _width(x: Tensor) -> float:
     return width
 
 
-def _check(points: Tensor, slopes: Tensor, at: Tensor, sigma: float | None, lam: float) -> None:
+def _check(points: Tensor, slopes: Tensor, at: Tensor, sigma: float | None, lam: float | Auto) -> None:
     name = "integrate_scattered"
     check_real(name, "points", points)
     for label, field in (("slopes", slopes), ("at", at)):
@@ -94,4 +120,5 @@ def _check(points: Tensor, slopes: Tensor, at: Tensor, sigma: float | None, lam:
     for label, field in (("points", points), ("slopes", slopes), ("at", at)):
         require(bool(field.isfinite().all()), f"{name}: {label} {tuple(field.shape)} is not finite")
     require(sigma is None or sigma > 0, f"{name}: sigma={sigma!r} given, a positive number is needed")
-    require(lam > 0, f"{name}: lam={lam!r} given, a positive number is needed")
+    fits = lam == "auto" if isinstance(lam, str) else lam > 0
+    require(fits, f"{name}: lam={lam!r} given, 'auto' or a positive number is needed")
