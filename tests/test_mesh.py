@@ -125,6 +125,20 @@ def test_a_sphere_from_its_normal_images(noise, bound):
     assert ((face_normals(found, faces) * found[faces].mean(1)).sum(1) > 0).all()
 
 
+@pytest.mark.slow
+def test_a_field_lets_faces_slide_where_fixed_targets_of_a_round_surface_spoil_them():
+    truth, faces = sphere(6, 10)
+    start = truth * torch.tensor([1.3, 0.8, 1.0], dtype=torch.float64) + 0.02 * random_field(*truth.shape, seed=1)
+    middles = torch.nn.functional.normalize(truth[faces].mean(1), dim=1)
+
+    def spread(normals):
+        x = fit_mesh(start, faces, normals, n_iter=6).vertices
+        radius = (x - x.mean(0)).norm(dim=1)
+        return radius.std() / radius.mean()
+
+    assert spread(lambda c, n: c / c.norm(dim=1, keepdim=True)) < min(0.03, 0.5 * spread(middles))
+
+
 def test_faces_without_a_target_follow_those_that_have_one():
     """A wave of which the normals are known on one half: the other half keeps its shape where the metric lets it."""
     y, x = torch.meshgrid(*(torch.arange(9, dtype=torch.float64),) * 2, indexing="ij")

@@ -133,7 +133,8 @@ def fit_mesh(
     Normals leave the position free, and the scale of closed shapes too: the mean of the vertices stays, the scale is
     about that of the start. Triangles are not made anew: the start must have the topology, and be near enough that none
     has to turn over. Targets that no mesh of these triangles has, such as those of the round surface itself, are fitted
-    at the price of thin triangles: stop after a few iterations (`n_iter`) there. On a grid use the integrators, which
+    at the price of thin triangles: stop after a few iterations (`n_iter`) there, or give them as a field, which each
+    face reads where it lies. On a grid use the integrators, which
     are exact and far faster. Not differentiable: it runs without recording.
 
     Args:
