@@ -3,12 +3,15 @@
 Every integrator with its defaults, and those forms of some that are not, on a smooth surface, a creased one, one that
 jumps, and the smooth one with outliers: RMSE in pixels and seconds of a core, means over fresh noise. Slopes of 20 dB;
 the jump is a lower half that rises from the upper one, tied to it at the left; outliers are 2 % of the samples, off by
-20 times the root mean square slope. Writes JSON and a table.
+20 times the root mean square slope. Writes JSON and a table; `--docs` runs nothing, and puts the figures of the JSON
+into the table of docs/which.md, as errors beside that of least squares.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import re
 import time
 import warnings
 from pathlib import Path
@@ -16,7 +19,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.common.report import made_by, markdown_table, results_folder, write_json
+from benchmarks.common.report import ROOT, made_by, markdown_table, results_folder, write_json
 from torchdls import (
     INTEGRATORS,
     SURFACES,
@@ -64,13 +67,35 @@ def fields(size: int, seed: int) -> dict[str, tuple[Tensor, Tensor]]:
     }
 
 
+def into_docs() -> None:
+    """The last column of the table of docs/which.md, and the line that says where it is from."""
+    found = json.loads((ROOT / "results" / "methods.json").read_text())
+    errors = {name: values for name, *values, _ in found["rows"]}
+    path = ROOT.parent / "docs" / "which.md"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    for i, line in enumerate(lines):
+        if match := re.match(r"(\| `(\w+)` \| `\w+` \| .*?) \|(?: [\d. /]+ \|)?$", line):
+            shares = [a / b for a, b in zip(errors[match[2]], errors["least_squares"], strict=True)]
+            lines[i] = f"{match[1]} | {' / '.join(f'{s:.2f}' for s in shares)} |"
+            last = i
+    made = f"Made by `python -m benchmarks.quality.methods` at {found['environment']['commit']}."
+    if lines[last + 2].startswith("Made by"):
+        lines[last + 2] = made
+    else:
+        lines[last + 1 : last + 1] = ["", made]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="small surfaces, one draw: does it run?")
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--seeds", type=int, default=3, help="noise draws per row")
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--docs", action="store_true", help="only put the figures of the last run into docs/which.md")
     args = parser.parse_args()
+    if args.docs:
+        return into_docs()
     size, seeds = (20, 1) if args.smoke else (args.size, args.seeds)
     draws = [fields(size, 9000 + seed) for seed in range(seeds)]
     rows = []
