@@ -57,6 +57,19 @@ def test_ssim_equals_scikit_image(dtype, tolerance):
     assert float(ssim(height - 40, s.height, 5)) == pytest.approx(expected, abs=1e-5)
 
 
+@pytest.mark.parametrize("data_range", [1e-200, 1e-9, 1.0, 1e200])
+def test_ssim_is_at_most_1_and_that_of_itself(data_range):
+    """Flat windows far from 0, whose variances are rounding where they are differences of squares."""
+    height = torch.full((1, 1, 24, 24), 1000.1, dtype=torch.float64)
+    height[..., 12:] += torch.randn(24, 12, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    other = height.clone()
+    other[..., 12:] += 0.1 * torch.randn(24, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    assert float(ssim(height, height, data_range)) == pytest.approx(1, abs=1e-12)
+    assert -1 <= float(ssim(height, other, data_range)) <= 1
+    plane = torch.zeros_like(height)
+    assert float(ssim(plane, plane, data_range)) == 1
+
+
 def test_ssim_counts_the_windows_inside_the_mask():
     height, reference = pair()
     mask = holed_mask()

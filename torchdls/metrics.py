@@ -7,7 +7,8 @@ or a reference of batch size 1 serves the whole batch.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import reduce
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,9 +17,6 @@ from torchdls._checks import check_field, check_fit
 from torchdls._precision import full_precision
 from torchdls._statistics import midpoint_median
 from torchdls.operators import as_pixel_size
-
-if TYPE_CHECKING:
-    pass
 
 _WINDOW = 11  # scikit-image's gaussian window: sigma 1.5 cut at 3.5 sigma
 
@@ -64,7 +62,7 @@ def ssim(height: Tensor, reference: Tensor, data_range: float, mask: Tensor | No
     The height is moved to the mean level of the reference. The windows are gaussian (11 x 11, sigma 1.5) and
     only those that lie inside the image and the mask count: the value is scikit-image's
     `structural_similarity` with `gaussian_weights=True, sigma=1.5, use_sample_covariance=False`. Evaluated in
-    float64 by kornia, since local variances of heights far from 0 cancel in float32.
+    float64, and from sums of squares: a variance of 0 is 0, so that no value is above 1 however small L is.
 
     The SSIM also compares local levels, so it depends on the level of the reference, and it saturates near 1
     where `data_range` is as large as the surface: report `rmse` beside it.
@@ -95,14 +93,12 @@ def ssim(height: Tensor, reference: Tensor, data_range: float, mask: Tensor | No
     height, reference, mask = _fields("ssim", height, reference, mask)
     if min(height.shape[-2:]) < _WINDOW:
         raise ValueError(f"ssim: height {tuple(given.shape)} is smaller than the {_WINDOW} x {_WINDOW} window")
-    from kornia.metrics import ssim as ssim_map
-
     wide = torch.float32 if height.device.type == "mps" else torch.float64  # MPS has no float64
     reference = torch.where(mask, reference, 0).to(wide)
     shift = _mean(reference - torch.where(mask, height, 0), mask)[..., None, None, None]
     height = torch.where(mask, height + shift, 0)
     height, reference, mask = (t.reshape(-1, 1, *given.shape[-2:]) for t in (height, reference, mask))
-    values = ssim_map(height, reference, _WINDOW, float(data_range), eps=0.0, padding="valid")
+    values = _similarity(height, reference, data_range)
     complete = ~_dilate(~mask)
     if not complete.flatten(1).any(1).all():
         raise ValueError(f"ssim: no {_WINDOW} x {_WINDOW} window lies inside the mask")
@@ -189,6 +185,43 @@ def mean_absolute_depth_error(depth: Tensor, reference: Tensor, mask: Tensor | N
     ratio = (reference / depth).flatten(-3)
     scale = midpoint_median(ratio, mask.flatten(-3) & ~ratio.isnan())
     return _mean(torch.where(mask, scale[..., None, None, None] * depth - reference, 0).abs(), mask)
+
+
+def _similarity(x: Tensor, y: Tensor, data_range: float) -> Tensor:
+    """SSIM of every window (N, 1, H - 10, W - 10)."""
+    unit = torch.maximum(x.abs(), y.abs()).detach().amax((1, 2, 3), keepdim=True).clamp(min=data_range)
+    c1, c2 = (0.01 * data_range / unit).square(), (0.03 * data_range / unit).square()
+    none = torch.zeros_like(x)
+    (mx, my), xx, yy, xy = _Window((x / unit, y / unit), none, none, none).along(-2).along(-1)
+    alike, size = (2 * mx * my + c1) * (2 * xy + c2), (mx.square() + my.square() + c1) * (xx + yy + c2)
+    flat = size == 0  # nothing there, and constants beyond the dtype
+    return torch.where(flat, 1, alike / torch.where(flat, 1, size))
+
+
+class _Window(NamedTuple):
+    """Means of two fields in gaussian windows, and their variances and covariance."""
+
+    means: tuple[Tensor, Tensor]
+    xx: Tensor
+    yy: Tensor
+    xy: Tensor
+
+    def along(self, dim: int) -> _Window:
+        """Windows that are longer along one more axis: variances within add to those of the means, nothing cancels."""
+        place = torch.arange(_WINDOW) - _WINDOW // 2
+        weight = (place.double().square() / (-2 * 1.5**2)).exp()
+        count = self.xx.shape[dim] - _WINDOW + 1
+        taps = [(float(g), k) for k, g in enumerate(weight / weight.sum())]
+
+        def mean(t: Tensor) -> Tensor:
+            return reduce(torch.add, (g * t.narrow(dim, k, count) for g, k in taps))
+
+        (x, y), (mx, my) = self.means, (mean(t) for t in self.means)
+        xx, yy, xy = mean(self.xx), mean(self.yy), mean(self.xy)
+        for g, k in taps:
+            dx, dy = x.narrow(dim, k, count) - mx, y.narrow(dim, k, count) - my
+            xx, yy, xy = xx + g * dx * dx, yy + g * dy * dy, xy + g * dx * dy
+        return _Window((mx, my), xx, yy, xy)
 
 
 def _fields(

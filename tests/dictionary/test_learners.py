@@ -19,6 +19,7 @@ from torchdls import (
     SoupDIL,
     orthogonal_matching_pursuit,
 )
+from torchdls.dictionary.polar import nearest_of_rank
 
 F64 = torch.float64
 
@@ -262,3 +263,40 @@ def test_dls_defaults_and_errors():
         KSVD(steps=0)
     with pytest.raises(ValueError, match="KSVD: n_nonzero=-1"):
         KSVD(n_nonzero=-1)
+
+
+@pytest.mark.parametrize(
+    "values, rank", [((3, 3, 1, 1), 2), ((3, 1, 1), 1), ((2, 2, 0), 2), ((5, 3, 2), 3), ((2, 2, 1, 1), 3)]
+)
+@pytest.mark.parametrize("shape", [(4, 4), (5, 4), (4, 6)], ids=str)
+def test_derivative_of_the_nearest_matrix_of_low_rank(values, rank, shape, generator):
+    """Also where singular values are equal, which the derivative through the SVD divides by the difference of."""
+    u, v = (torch.linalg.qr(torch.randn(n, 4, generator=generator, dtype=torch.float64)).Q for n in shape)
+    s = torch.tensor([*values, *[0] * (4 - len(values))], dtype=torch.float64)
+    M = ((u * s) @ v.mT)[None].requires_grad_()
+    if s[rank - 1] > s[rank]:
+        assert torch.autograd.gradcheck(lambda M: nearest_of_rank(M, rank), M)
+        assert torch.autograd.gradcheck(lambda M: nearest_of_rank(M, rank), M, check_forward_ad=True)
+        torch.testing.assert_close(nearest_of_rank(M, rank)[0], (u[:, :rank] * s[:rank]) @ v.mT[:rank])
+    else:  # there are several nearest ones
+        (pull,) = torch.autograd.grad(nearest_of_rank(M, rank).square().sum(), M)
+        assert bool(pull.isfinite().all())
+        torch.testing.assert_close((M - nearest_of_rank(M, rank)).square().sum(), s[rank:].square().sum())
+
+
+def test_second_derivative_of_the_nearest_matrix_of_low_rank(generator):
+    M = torch.randn(2, 3, 4, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradgradcheck(lambda M: nearest_of_rank(M, 2), M)
+    by_hand = torch.func.vmap(torch.func.grad(lambda M: (nearest_of_rank(M, 1) * M.detach()).sum()))(M.detach())
+    (pull,) = torch.autograd.grad((nearest_of_rank(M, 1) * M.detach()).sum(), M)
+    torch.testing.assert_close(by_hand, pull)
+
+
+def test_atoms_of_equal_singular_values_have_a_derivative():
+    """Two of three are equal: kept together, and where one would have to be chosen."""
+    h = torch.eye(3, dtype=torch.float64)
+    h[2, 2] = 0.5
+    h = h.reshape(1, 9, 1).requires_grad_()
+    assert torch.autograd.gradcheck(DinoKat(2).project, h)
+    (pull,) = torch.autograd.grad(DinoKat(1).project(h).sum(), h)
+    assert bool(pull.isfinite().all())

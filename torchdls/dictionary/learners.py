@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchdls._precision import full_precision
+from torchdls.dictionary.polar import nearest_of_rank
 from torchdls.dictionary.pursuit import orthogonal_matching_pursuit
 from torchdls.dictionary.soup_dil import Order, Unused, residual_sweep
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold
@@ -122,7 +123,7 @@ class DinoKat:
 
     The best such atom is the product h of the sweep, cut to its largest singular values and normalised. A learned atom
     has fewer parameters, so less noise enters it. Start from atoms of that rank, as the cosine ones are. Differentiable
-    where the singular values of h differ.
+    where the last singular value that is kept differs from the first that is not; others may be equal.
 
     Args:
         rank: of the atoms, at least 1.
@@ -171,10 +172,8 @@ class DinoKat:
             raise ValueError(f"DinoKat: patch_size={self.patch_size!r} does not fit patches of {n} pixels")
         matrices = h[..., 0].unflatten(-1, shape)
         some = (matrices != 0).flatten(1).any(1)[:, None, None]
-        # What stands in for 0 has singular values that differ: their derivative is finite, and goes nowhere.
         ladder = torch.diag(torch.arange(1, max(shape) + 1, dtype=h.dtype, device=h.device))[: shape[0], : shape[1]]
-        u, s, v = torch.linalg.svd(torch.where(some, matrices, ladder), full_matrices=False)
-        cut = (u[..., : self.rank] * s[..., None, : self.rank]) @ v[..., : self.rank, :]
+        cut = nearest_of_rank(torch.where(some, matrices, ladder), self.rank)  # what stands in for 0 goes nowhere
         return torch.where(some, cut, 0).flatten(1)[..., None]
 
 

@@ -1,4 +1,4 @@
-r"""The nearest orthonormal matrix, with a derivative that exists where singular values are equal.
+r"""The nearest orthonormal matrix and the nearest of low rank, with derivatives where singular values are equal.
 
 For M = Q S with Q^T Q = I and S symmetric, no singular value 0, the polar factor Q is a smooth function of M:
 
@@ -6,6 +6,12 @@ For M = Q S with Q^T Q = I and S symmetric, no singular value 0, the polar facto
 
 In the eigenvectors of S this divides by sums s_i + s_j of singular values, never by their differences, as a derivative
 through the SVD would. The map from dM to dQ is its own adjoint, so that the same line serves in both directions.
+
+The sum T of the first r terms of M = \sum_k s_k u_k v_k^T is smooth while s_r > s_{r+1}. With E = U^T dM V, i <= r < j,
+
+    (U^T dT V)_{ij} = (s_i^2 E_ij + s_i s_j E_ji) / (s_i^2 - s_j^2)        (U^T dT V)_{ji} alike, of E_ji and E_ij
+
+and E within the first r, 0 within the others: no difference of two values on the same side. It is its own adjoint, too.
 """
 
 from __future__ import annotations
@@ -94,3 +100,53 @@ class _Lyapunov(torch.autograd.Function):
         change = change if dS is None else change - W @ dS - dS @ W
         turn: Tensor = _Lyapunov.apply(S, change)
         return turn
+
+
+def nearest_of_rank(M: Tensor, rank: int) -> Tensor:
+    """The matrix (.., m, n) of at most the given rank that is nearest to M; its derivative where s_r > s_{r+1}.
+
+    Where those are equal there are several, and what they leave open is taken not to move.
+    """
+    nearest: Tensor = _LowRank.apply(M, rank)
+    return nearest
+
+
+class _LowRank(torch.autograd.Function):
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(M: Tensor, rank: int) -> Tensor:
+        u, s, v = torch.linalg.svd(M, full_matrices=False)
+        return (u[..., :rank] * s[..., None, :rank]) @ v[..., :rank, :]
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        M, ctx.rank = inputs
+        ctx.save_for_backward(M)
+        ctx.save_for_forward(M)
+
+    @staticmethod
+    @full_precision
+    def backward(ctx: Any, dT: Tensor) -> tuple[Tensor, None]:
+        (M,) = ctx.saved_tensors
+        return _moved(M, ctx.rank, dT), None
+
+    @staticmethod
+    def jvp(ctx: Any, dM: Tensor, _: None) -> Tensor:
+        (M,) = ctx.saved_tensors
+        return _moved(M, ctx.rank, dM)
+
+
+def _moved(M: Tensor, rank: int, change: Tensor) -> Tensor:
+    """dT for dM, or the pull of dT back to M: as if s_j were 0, and what the s_j add."""
+    u, s, v = torch.linalg.svd(M, full_matrices=False)
+    (u, u_j), (s, s_j), (v, v_j) = (t.tensor_split([rank], -1) for t in (u, s, v.mT))
+    left = u @ (u.mT @ change)
+    moved = left + (change - left) @ v @ v.mT
+    s, s_j = s[..., :, None], s_j[..., None, :]
+    gap = (s - s_j) * (s + s_j)
+    held = gap > torch.finfo(s.dtype).eps * s.amax((-2, -1), keepdim=True).square()
+    ahead, behind = u.mT @ change @ v_j, (u_j.mT @ change @ v).mT
+    share = torch.where(held, s_j / torch.where(held, gap, 1), 0)
+    ahead, behind = share * (s_j * ahead + s * behind), share * (s_j * behind + s * ahead)
+    return moved + u @ ahead @ v_j.mT + u_j @ behind.mT @ v.mT
