@@ -49,6 +49,7 @@ class Case:
         spoilt: the argument that was made wrong, whose name the message must hold.
         must_raise: whether it must be refused.
         wild: whether numbers are so large that the height may be beyond its dtype.
+        patient: whether relations are asked only of results that came without a `ConvergenceWarning`.
         judge: looks at a result: (case, function, values, result).
         label: of the judge, for the report.
     """
@@ -58,6 +59,7 @@ class Case:
     spoilt: str | None = None
     must_raise: bool = False
     wild: bool = False
+    patient: bool = False
     judge: Judge | None = None
     label: str = ""
     options: tuple[str, ...] = field(default=())
@@ -76,7 +78,7 @@ class Case:
         given = {name: eval(code, NAMES) for name, code in self.arguments.items()}
         before = [(name, t, t.clone(), t._version) for name, t in given.items() if isinstance(t, Tensor)]
         try:
-            with bounded(), no_warning():
+            with bounded(), no_warning() as warned:
                 result = f(**given)
         except (ValueError, TypeError) as error:
             self._named(error, (*self.arguments, *self.options))
@@ -88,10 +90,14 @@ class Case:
         if self.must_raise:
             raise Flaw(f"{self.spoilt} was accepted")
         if self.spoilt is None:
-            with bounded(), no_warning():
-                check_finite(result)
+            check_finite(result)
+            with bounded(), no_warning() as told:
                 if self.judge is not None:
-                    self.judge(self, f, given, result)
+                    try:
+                        self.judge(self, f, given, result)
+                    except Flaw:
+                        if not self.patient or not (warned or told):
+                            raise
         return True
 
     def _named(self, error: Exception, names: tuple[str, ...]) -> None:
@@ -145,11 +151,11 @@ def close(actual: Tensor, expected: Tensor, tol: float, what: str, floor: float 
 
 
 @contextmanager
-def no_warning() -> Iterator[None]:
+def no_warning() -> Iterator[list[warnings.WarningMessage]]:
     """Every warning but that about convergence is a flaw."""
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
-        yield
+        yield seen
     for warning in seen:
         if not issubclass(warning.category, torchdls.ConvergenceWarning) and "torch.jit" not in str(warning.message):
             raise Flaw(f"warned: {warning.category.__name__}: {warning.message}")

@@ -6,13 +6,14 @@ import pytest
 import torch
 
 import torchdls
-from tests.fuzz.case import Case, same_bits
+from tests.fuzz.case import Case, Flaw, same_bits
 from tests.fuzz.run import draw, judge
 from tests.fuzz.targets import ELSEWHERE, PICTURES, TARGETS
 from tests.fuzz.values import firm, mask, rational_solve, trust
 from tests.helpers import random_field, sparse_solve
 
 SEED, CASES, AT_ONCE = 20, 2000, 100
+WARNING = "torchdls.ConvergenceWarning"
 
 
 @pytest.mark.slow
@@ -56,6 +57,14 @@ def test_the_oracles_object():
     assert "accepted" in flaw("lambda x: x", spoilt="x", must_raise=True)
     assert "names none" in flaw("lambda x: int('y')", spoilt="x")
     assert flaw("lambda x: torchdls.dct2(x)", spoilt="x") == ""
+    far, near = (f"lambda x: __import__('warnings').warn('', {kind}) or x" for kind in (WARNING, "FutureWarning"))
+
+    def off(case, f, given, result):
+        raise Flaw("off")
+
+    assert flaw("lambda x: x", off, patient=True) == flaw(far, off) == "off"
+    assert flaw(far, off, patient=True) == ""
+    assert "warned" in flaw(near, off, patient=True)
 
 
 def test_rational_numbers_agree_with_scipy():
