@@ -32,7 +32,7 @@ MAY_IMPORT |= {
     "persistence": {"integrators"},
     "anchors": {"operators", "solvers"},
     "reconstruction": {"operators", "geometry", "integrators", "anchors"},
-    "large": {"operators", "solvers", "noise", "integrators", "geometry"},
+    "large": {"operators", "solvers", "dictionary", "noise", "integrators", "geometry"},
     "batch": {"operators", "solvers", "integrators", "geometry", "io"},
     "_registry": {"dictionary", "integrators"},  # for their types alone: it is read before PyTorch is loaded
 }

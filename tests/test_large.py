@@ -8,10 +8,13 @@ import pytest
 import torch
 from scipy.ndimage import label
 
+from tests.helpers.large import BLOCK, disk_ring_and_specks, field, whole
 from torchdls import (
     DLS,
     ConvergenceWarning,
     GradientOperator,
+    HarkerOLeary,
+    Huber,
     LeastSquares,
     SlopeDLS,
     add_noise,
@@ -33,16 +36,6 @@ from torchdls.large.files import Field
 from torchdls.large.slope_dls import spans
 from torchdls.large.transform import Passes
 from torchdls.surfaces import SURFACES
-
-
-def field(h, w, dtype=np.float64):
-    rng = np.random.default_rng(h * w)
-    g = SURFACES["peaks"](max(h, w), dtype=torch.float64).gradient[0, :, :h, :w].numpy()
-    return (g + 0.3 * rng.normal(size=g.shape)).astype(dtype)
-
-
-def whole(g, **options):
-    return LeastSquares(**options)(torch.from_numpy(np.ascontiguousarray(g)))[0].numpy()
 
 
 @pytest.mark.parametrize("size", [(100, 130), (65, 40), (1, 90), (90, 1), (33, 200)])
@@ -171,8 +164,13 @@ def test_from_the_command_line(tmp_path, capsys):
     assert "100 x 90 pixels" in capsys.readouterr().out
     found = io.load_height(tmp_path / "z.tiff").height[0, 0].numpy()
     np.testing.assert_allclose(found, whole(np.load(tmp_path / "g.npy")), rtol=0, atol=1e-4)
-    assert main([*arguments, "--method", "dls"]) == 2
-    assert "--tile: least_squares and slope_dls alone" in capsys.readouterr().err
+    assert main([*arguments, "--method", "l1"]) == 2
+    assert "--tile: least_squares, slope_dls and dls alone" in capsys.readouterr().err
+    assert main([*arguments, "--method", "dls", "--force"]) == 2
+    assert "learner, select of DLS" in capsys.readouterr().err
+    fixed = ["--set", "learn=fixed", "--set", "select=False", "--set", "n_iter=1"]
+    assert main([*arguments, "--method", "dls", *fixed, "--force"]) == 0
+    assert "noise" in capsys.readouterr().out
     assert main([*arguments, "--method", "slope_dls", "--set", "recipe=quick", "--force"]) == 0
     assert "noise" in capsys.readouterr().out
     tiled, expected = np.empty((100, 90), np.float32), np.load(tmp_path / "g.npy")
@@ -262,7 +260,12 @@ def test_windows_cover_the_surface_and_their_weights_add_up(n, tile, halo):
 @pytest.mark.parametrize(
     "integrator, error, match",
     [
-        (DLS(), TypeError, "LeastSquares or SlopeDLS"),
+        (HarkerOLeary(), TypeError, "LeastSquares, SlopeDLS or DLS"),
+        (DLS(), ValueError, "learner, select of DLS"),
+        (DLS(learner=BLOCK), ValueError, "select of DLS"),
+        (DLS(learner=BLOCK, mu=0.1, height_step="proximal"), ValueError, "height_step of DLS"),
+        (DLS(learner=BLOCK, mu=0.1, data_term=Huber()), ValueError, "data_term of DLS"),
+        (DLS(learn="fixed", mu=0.1, boundary="periodic"), ValueError, "boundary of DLS"),
         (SlopeDLS(recipe="plain"), ValueError, "not done in tiles"),
         (SlopeDLS(robust=True), ValueError, "robust=True"),
         (SlopeDLS(guard="sure"), ValueError, "guard='sure'"),
@@ -273,14 +276,6 @@ def test_windows_cover_the_surface_and_their_weights_add_up(n, tile, halo):
 def test_what_is_not_done_in_tiles(integrator, error, match):
     with pytest.raises(error, match=match):
         large.integrate(np.zeros((2, 8, 8)), np.zeros((8, 8)), integrator=integrator)
-
-
-def disk_ring_and_specks(h, w):
-    y, x = np.mgrid[:h, :w]
-    radius = np.hypot(y - h / 2, x - w / 2)
-    mask = (radius < 0.3 * min(h, w)) | ((radius > 0.36 * min(h, w)) & (radius < 0.48 * min(h, w)))
-    mask |= np.random.default_rng(0).random((h, w)) < 0.02
-    return mask & (x != w // 2 + 3)
 
 
 @pytest.mark.parametrize("tile, step", [(7, (1.0, 1.0)), (33, (2.0, 0.5)), (200, (1.0, 1.0))])
@@ -331,86 +326,6 @@ def test_components_over_bands(tile, tmp_path):
     assert pairs.shape[1] == count  # one number each
     for own, theirs in pairs.T:
         assert parts.size[theirs] == (labels == own).sum()
-
-
-def trusts(h, w, planes=1):
-    """From next to nothing to a hundred, none in a corner."""
-    rng = np.random.default_rng(h + w)
-    found = 10.0 ** rng.uniform(-2, 1, (planes, h, w)) * (1 + np.linspace(0, 9, w))
-    found[:, : h // 5, : w // 4] = 0
-    return found
-
-
-BESIDE = {
-    "weight": lambda h, w: {"weight": trusts(h, w)},
-    "weights of both slopes, mask": lambda h, w: {"weight": trusts(h, w, 2), "mask": disk_ring_and_specks(h, w)},
-    "anchor": lambda h, w: {"anchor": np.full((h, w), 1e3), "anchor_weight": 0.1},
-    "a few anchors": lambda h, w: {
-        "anchor": np.where(trusts(h, w)[0] > 90, 7.0, np.nan),
-        "anchor_weight": np.where(trusts(h, w)[0] > 90, 3.0, 0),
-    },
-    "all": lambda h, w: {
-        "mask": disk_ring_and_specks(h, w),
-        "weight": trusts(h, w),
-        "anchor": np.random.default_rng(1).normal(50, 1, (h, w)),
-        "anchor_weight": trusts(h, w)[0] * (np.arange(w) > w // 3),
-    },
-    "firm": lambda h, w: {"anchor": np.random.default_rng(1).normal(50, 1, (h, w)), "anchor_weight": 9.0},
-}
-
-
-@pytest.mark.parametrize(
-    "tile, kind", [*((25, kind) for kind in BESIDE), (9, "all"), (100, "weight"), (17, "a few anchors")]
-)
-def test_weights_and_anchors_equal_those_in_memory(tile, kind):
-    h, w, step = 34, 41, (0.8, 1.25)
-    beside, g, found = BESIDE[kind](h, w), field(h, w), np.empty((h, w))
-    exact = LeastSquares(tol=1e-12, max_iter=3000, pixel_size=step)
-    result = large.integrate(g, found, **beside, integrator=exact, tile=tile)
-    assert result.converged
-    tensors = {
-        name: torch.from_numpy(np.broadcast_to(part, (1, h, w)).copy() if np.ndim(part) < 3 else part)
-        for name, part in beside.items()
-    }
-    expected = exact(torch.from_numpy(g), **tensors)[0].numpy()
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * np.ptp(expected))
-
-
-def test_anchors_far_away_in_single_precision(tmp_path):
-    h, w = 64, 48
-    g, mask = field(h, w, np.float32), disk_ring_and_specks(h, w)
-    r = np.where(np.random.default_rng(0).random((h, w)) < 0.05, 1, 0).astype(np.float32)
-    a = (1e5 + whole(g)).astype(np.float32)
-    for name, array in {"g": g, "m": mask, "a": a, "r": r}.items():
-        np.save(tmp_path / f"{name}.npy", array)
-    files = {"mask": tmp_path / "m.npy", "anchor": tmp_path / "a.npy", "anchor_weight": tmp_path / "r.npy"}
-    large.integrate(tmp_path / "g.npy", tmp_path / "z.npy", **files, tile=20)
-    slopes, heights, trust = (torch.from_numpy(x).double() for x in (g, a[None], r[None]))
-    inside = torch.from_numpy(mask)[None]
-    expected = LeastSquares(tol=1e-10)(slopes, inside, anchor=heights, anchor_weight=trust)[0].numpy()
-    np.testing.assert_allclose(np.load(tmp_path / "z.npy"), expected, rtol=0, atol=0.05)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npy", "g.npy", "m.npy", "r.npy", "z.npy"]
-
-
-@pytest.mark.parametrize(
-    "beside, match",
-    [
-        ({"weight": np.ones((8, 9))}, r"weight \(8, 9\)"),
-        ({"weight": np.ones((3, 8, 8))}, r"weight \(3, 8, 8\)"),
-        ({"weight": np.full((8, 8), -1.0)}, "weight is negative or not finite in rows 0 to"),
-        ({"weight": np.full((8, 8), np.nan)}, "weight is negative or not finite"),
-        ({"weight": np.zeros((8, 8))}, "no pixel has a neighbour that is trusted"),
-        ({"anchor": np.ones((8, 8))}, "anchor is given without anchor_weight"),
-        ({"anchor_weight": 1.0}, "anchor_weight is given without anchor"),
-        ({"anchor": np.ones((8, 7)), "anchor_weight": 1.0}, r"anchor \(8, 7\)"),
-        ({"anchor": np.ones((8, 8)), "anchor_weight": np.inf}, "anchor_weight is negative or not finite"),
-        ({"anchor": np.full((8, 8), np.nan), "anchor_weight": 1.0}, "anchor is not finite in rows 0 to"),
-        ({"weight": np.ones((8, 8)), "integrator": SlopeDLS()}, "weight is given, which least squares alone"),
-    ],
-)
-def test_what_weights_and_anchors_may_not_be(beside, match):
-    with pytest.raises(ValueError, match=match):
-        large.integrate(np.zeros((2, 8, 8)), np.zeros((8, 8)), **beside)
 
 
 def test_what_a_mask_may_not_be():

@@ -47,8 +47,8 @@ def add_integrate(commands: Any) -> None:
     add("--coarse", metavar="FILE", help="a depth of any scale and offset, as a network guesses it, that places what "
         "nothing else ties; NaN, or depth 0, where unknown")  # fmt: skip
     add_manner(command)
-    add("--tile", type=int, metavar="N", help="least_squares (also with --mask) or slope_dls of an NPY, Zarr or TIFF "
-        "of floats, larger than memory if need be, by N rows (slope_dls: tiles), to NPY, Zarr or BigTIFF")  # fmt: skip
+    add("--tile", type=int, metavar="N", help="least_squares (also with --mask), slope_dls or dls of an NPY, Zarr or "
+        "TIFF of floats, larger than memory if need be, by N rows (dls: tiles), to NPY, Zarr or BigTIFF")  # fmt: skip
     add("--unit", metavar="NAME", help="unit of the heights, for the labels of pictures, such as mm")
     add("--force", action="store_true", help="replace output files that exist")
     add("--quiet", action="store_true", help="no progress bar and no report")
@@ -177,11 +177,11 @@ def _depths(option: str, path: str, gradient: Tensor, deep: bool) -> Tensor:
 
 
 def _integrate_large(arguments: argparse.Namespace) -> None:
-    """Least squares out of core, or SlopeDLS by tiles."""
+    """Least squares out of core, or SlopeDLS or DLS by tiles."""
     from torchdls import large
 
-    if arguments.method not in ("least_squares", "slope_dls"):
-        raise ValueError("--tile: least_squares and slope_dls alone are done in tiles")
+    if arguments.method not in ("least_squares", "slope_dls", "dls"):
+        raise ValueError("--tile: least_squares, slope_dls and dls alone are done in tiles")
     for name in ("camera", "channels"):
         if getattr(arguments, name) is not None:
             raise ValueError(f"--tile: gradients and normals of floats alone are done in tiles, --{name} is given")

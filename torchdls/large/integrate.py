@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from torchdls.integrators import Integrator, LeastSquares, SlopeDLS
+from torchdls.integrators import DLS, Integrator, LeastSquares, SlopeDLS
+from torchdls.large.dls import Run, check_dls
 from torchdls.large.files import Field, checked_output, parts, write
 from torchdls.large.least_squares import least_squares
 from torchdls.large.slope_dls import HALO, noise_of, slope_dls, spans
@@ -31,11 +32,11 @@ class LargeResult(NamedTuple):
 
     Attributes:
         shape: (H, W).
-        tile: rows of a band, and columns of a strip; of SlopeDLS the side of a tile.
+        tile: rows of a band, and columns of a strip; of SlopeDLS and DLS the side of a tile.
         passes: the bands, strips and bands of the (last) solve.
         tiles: rows and columns of tiles; (0, 0) for least squares, which needs none.
-        noise: standard deviation of one gradient sample, as SlopeDLS took it; None for least squares.
-        iterations: of conjugate gradients with a mask, weights or anchors, else 0.
+        noise: standard deviation of one gradient sample, as SlopeDLS or DLS took it; None where none is asked for.
+        iterations: of conjugate gradients with a mask, weights or anchors, or of DLS; else 0.
         converged: whether they met the tolerance within the limit of the integrator.
     """
 
@@ -66,7 +67,7 @@ def integrate(
     overwrite: bool = False,
     progress: Callable[[str], None] = lambda text: None,
 ) -> LargeResult:
-    r"""The height of a field that need not fit into memory, by `LeastSquares` or `SlopeDLS`.
+    r"""The height of a field that need not fit into memory, by `LeastSquares`, `SlopeDLS` or `DLS`.
 
     Least squares is exact: equal to that of the whole to rounding, in three passes over a file. SlopeDLS smooths tiles
     with a halo, with the noise level of the whole, and blends the slopes of what it changed,
@@ -76,11 +77,16 @@ def integrate(
     by one exact solve; slow waves, and how far least squares is left, are then judged by the whole. One tile is
     SlopeDLS itself; more differ by some percent of its error (docs/scale.md).
 
+    DLS goes patch by patch and is that of the whole to rounding, with the learner `SoupDIL(order="block")` or "fixed",
+    whose sweep needs two sums over all patches alone; its height step goes by conjugate gradients whose vectors are
+    files. With mu="auto" the threshold is the median of the noise levels of the tiles.
+
     With a mask, weights or anchors, least squares goes by conjugate gradients whose vectors are files, preconditioned
     by that of the full rectangle; they stop at the integrator's `tol`.
 
     Besides the files it takes `scratch` space of one height (SlopeDLS: two; with a mask: four, and eight bytes for each
-    pixel; with weights or anchors three more), and `memory` for its own arrays; time grows as H W log(H W).
+    pixel; with weights or anchors three more; DLS: nine, and its codes that are not 0), and `memory` for its own
+    arrays; time grows as H W log(H W).
 
     Args:
         source: gradient (2, H, W) or normals (3, H, W) of floats: an NPY file, a Zarr array, an uncompressed TIFF, or
@@ -92,12 +98,13 @@ def integrate(
         weight: (H, W), (1, H, W) or (2, H, W) likewise, at least 0: trust in the slopes, for least squares alone.
         anchor: (H, W) likewise, known heights, read only where `anchor_weight` > 0; for least squares alone.
         anchor_weight: (H, W) likewise, or one number, at least 0: trust in the anchors.
-        integrator: `LeastSquares()`, which None stands for, or `SlopeDLS(...)` with the recipe "blend" or "quick",
-            without `robust`, with one noise level or None, and with the guard "discrepancy" or None.
+        integrator: `LeastSquares()`, which None stands for; `SlopeDLS(...)` with the recipe "blend" or "quick",
+            without `robust`, with one noise level or None, and with the guard "discrepancy" or None; or `DLS(...)` with
+            a learner as above, least squares as its data term, the exact height step and `select=False`.
         convention: of the gradient (default: image) or of the normals (default: opengl).
         pixel_size: (dx, dy) or one number; None for that of the integrator.
-        tile: rows of a band and columns of a strip, or the side of a tile of SlopeDLS; None for as many as `memory`
-            holds.
+        tile: rows of a band and columns of a strip, or the side of a tile of SlopeDLS and DLS; None for as many as
+            `memory` holds.
         halo: pixels that a tile sees beyond itself on every side.
         memory: bytes for arrays of its own; pages of files in the system's cache are not counted.
         scratch: folder for the files in between; None for that of `out`, or the usual one for temporary files.
@@ -127,7 +134,7 @@ def integrate(
     given = {"mask": mask, "weight": weight, "anchor": anchor, "anchor_weight": anchor_weight}
     _check(method, tile, halo, [name for name, part in given.items() if part is not None])
     field = Field.open(source, convention, **given)
-    size, smooths = field.shape, isinstance(method, SlopeDLS)
+    size, smooths = field.shape, isinstance(method, SlopeDLS | DLS)
     held = (
         rows_at_once(memory, size, field.dtype, 3 if weight is not None else 1 if field.bare and not smooths else 2)
         if tile is None or smooths
@@ -142,9 +149,17 @@ def integrate(
         passes = Passes(field, step, held, Path(place), progress)
         if isinstance(method, SlopeDLS):
             windows = spans(size[0], tile, halo), spans(size[1], tile, halo)
-            level = noise_of(passes, method, windows)
+            level = noise_of(passes, method.sigma, windows)
             heights = slope_dls(passes, method, windows, level)
             result = result._replace(tiles=(len(windows[0]), len(windows[1])), noise=float(level))
+        elif isinstance(method, DLS):
+            windows = spans(size[0], tile, halo), spans(size[1], tile, halo)
+            automatic = isinstance(method.mu, str)
+            noise = float(noise_of(passes, None, windows)) if automatic else None
+            run = Run(passes, method, tile, noise or 0.0)
+            done = run.follow()
+            result = result._replace(tiles=(len(windows[0]), len(windows[1])), noise=noise, iterations=done.iterations)
+            result, heights = result._replace(converged=done.converged), run.heights()
         elif isinstance(method, LeastSquares) and not field.bare:
             system = System(passes)
             converged = system.solve(method.tol, method.max_iter)
@@ -153,7 +168,7 @@ def integrate(
         else:
             heights = least_squares(passes)
         write(out, heights, size, field.dtype, overwrite)
-    if not result.converged:
+    if not result.converged and isinstance(method, LeastSquares):
         warnings.warn(
             f"large.integrate: stopped after {result.iterations} iterations at a relative residual of "
             f"{system.residual:.1e}, where tol={method.tol:.1e} is asked for",
@@ -174,13 +189,16 @@ def _tile(memory: int, halo: int, dtype: Any) -> int:
 def _check(method: Integrator, tile: int | None, halo: int, beside: Sequence[str]) -> None:
     if type(method) is LeastSquares:
         usable = method.boundary == "neumann"
+    elif type(method) is DLS:
+        check_dls(method)
+        usable = True
     elif type(method) is SlopeDLS:
         single = method.sigma is None or torch.as_tensor(method.sigma).numel() == 1
         usable = method.recipe != "plain" and not method.robust and method.guard != "sure" and single
-        if beside:
-            raise ValueError(f"large.integrate: {beside[0]} is given, which least squares alone takes")
     else:
-        raise TypeError(f"large.integrate: integrator={method!r} given, LeastSquares or SlopeDLS is needed")
+        raise TypeError(f"large.integrate: integrator={method!r} given, LeastSquares, SlopeDLS or DLS is needed")
+    if beside and type(method) is not LeastSquares:
+        raise ValueError(f"large.integrate: {beside[0]} is given, which least squares alone takes")
     if not usable:
         raise ValueError(f"large.integrate: {method!r} is not done in tiles, with these options")
     if tile is not None and not tile > 0:

@@ -99,10 +99,10 @@ def in_pixels(step: tuple[float, float]) -> tuple[float, tuple[float, float]]:
     return unit, (step[0] / unit, step[1] / unit)
 
 
-def noise_of(passes: Passes, integrator: SlopeDLS, windows: Windows) -> Tensor:
+def noise_of(passes: Passes, sigma: float | Tensor | None, windows: Windows) -> Tensor:
     """(1,) the noise level that is given, or the median of those of all windows: a few with creases do not count."""
-    if integrator.sigma is not None:
-        return as_tensor(np.asarray([float(integrator.sigma)], passes.field.dtype))
+    if sigma is not None:
+        return as_tensor(np.asarray([float(sigma)], passes.field.dtype))
     (rows, columns), steps = windows, in_pixels(passes.step)[1]
     passes.say(f"the noise of {len(rows)} x {len(columns)} tiles")
     levels: list[float] = []
