@@ -1,8 +1,9 @@
 """Surfaces out of core: `python -m benchmarks.speed.large` (minutes, 4 GB of disk; --smoke, or --sizes 4096 8192).
 
 Time, the largest memory of the process's own (pages of files left out), and the difference from the whole where that is
-made as well (least squares up to 4096 pixels a side, SlopeDLS up to 1024). `--method slope_dls --surface tent --tile
-256` measures SlopeDLS by tiles: errors of the tiles, the whole and least squares on a surface with noise (5 dB).
+made as well (least squares up to 4096 pixels a side, SlopeDLS and DLS up to 1024 or `--whole`). `--method slope_dls
+--surface tent --tile 256` measures SlopeDLS by tiles, `--method dls` DLS: errors of the tiles, the whole and least
+squares on a surface with noise (5 dB), and time of the core.
 """
 
 from __future__ import annotations
@@ -20,8 +21,7 @@ import torch
 
 from benchmarks.common.report import results_folder, write_json
 from benchmarks.common.timing import fresh_process
-from torchdls import LeastSquares, SlopeDLS, add_noise, large
-from torchdls.integrators.slope_dls.integrator import Recipe
+from torchdls import DLS, Integrator, LeastSquares, SlopeDLS, SoupDIL, add_noise, large
 from torchdls.surfaces import SURFACES
 
 
@@ -83,12 +83,19 @@ def write_surface(folder: Path, name: str, n: int) -> None:
     np.save(folder / "true.npy", surface.height[0, 0].numpy())
 
 
-def tiles(folder: Path, tile: int, recipe: Recipe) -> dict[str, Any]:
-    """SlopeDLS by tiles of the surface in a folder."""
+def method_of(recipe: str) -> Integrator:
+    """SlopeDLS of a recipe, or DLS of so many iterations."""
+    if recipe.startswith("dls"):
+        return DLS(learner=SoupDIL(order="block"), select=False, n_iter=int(recipe[3:]))
+    return SlopeDLS(recipe=recipe)  # type: ignore[arg-type]
+
+
+def tiles(folder: Path, tile: int, recipe: str, whole_up_to: int) -> dict[str, Any]:
+    """SlopeDLS or DLS by tiles of the surface in a folder."""
     torch.set_num_threads(1)
     begin, start, cpu = own_megabytes(), time.perf_counter(), time.process_time()
     with Watch() as watch:
-        integrator = SlopeDLS(recipe=recipe)
+        integrator = method_of(recipe)
         result = large.integrate(folder / "g.npy", folder / "z.npy", integrator=integrator, tile=tile)
     row: dict[str, Any] = {"recipe": recipe, "size": result.shape[0], "tile": tile, "tiles": result.tiles}
     row |= {"seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - cpu}
@@ -96,7 +103,7 @@ def tiles(folder: Path, tile: int, recipe: Recipe) -> dict[str, Any]:
     true, g = np.load(folder / "true.npy"), torch.from_numpy(np.load(folder / "g.npy"))
     row["rmse"] = deviation(np.load(folder / "z.npy"), true)
     row["rmse_least_squares"] = deviation(LeastSquares()(g)[0].numpy(), true)
-    if result.shape[0] <= 1024:
+    if result.shape[0] <= whole_up_to:
         cpu = time.process_time()
         row["rmse_whole"] = deviation(integrator(g)[0].numpy(), true)
         row["cpu_seconds_whole"] = time.process_time() - cpu
@@ -114,7 +121,9 @@ def measure_tiles(args: argparse.Namespace) -> list[dict[str, Any]]:
         with tempfile.TemporaryDirectory() as folder:
             write_surface(Path(folder), args.surface, n)
             tile = 16 if args.smoke else args.tile
-            said = fresh_process("benchmarks.speed.large", "--tiles", folder, str(tile), args.recipe)
+            recipe = f"dls{args.iterations}" if args.method == "dls" else args.recipe
+            given = folder, str(tile), recipe, str(args.whole)
+            said = fresh_process("benchmarks.speed.large", "--tiles", *given)
         rows.append({"surface": args.surface} | json.loads(said.splitlines()[-1]))
         print(rows[-1], flush=True)
     return rows
@@ -125,21 +134,24 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="tiny sizes, to see that it runs")
     parser.add_argument("--sizes", type=int, nargs="+", default=[2048, 4096, 8192, 16384])
     parser.add_argument("--memory", type=int, default=1024, help="megabytes (default: 1024)")
-    parser.add_argument("--method", choices=("least_squares", "slope_dls"), default="least_squares")
+    parser.add_argument("--method", choices=("least_squares", "slope_dls", "dls"), default="least_squares")
     parser.add_argument("--surface", choices=SURFACES, default="tent", help="of slope_dls")
-    parser.add_argument("--tile", type=int, default=512, help="of slope_dls")
+    parser.add_argument("--tile", type=int, default=512, help="of slope_dls and dls")
     parser.add_argument("--recipe", choices=("blend", "quick"), default="quick", help="of slope_dls")
-    parser.add_argument("--tiles", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--iterations", type=int, default=3, help="of dls")
+    parser.add_argument("--whole", type=int, default=1024, help="the largest size that is made whole as well")
+    parser.add_argument("--tiles", nargs=4, help=argparse.SUPPRESS)
     parser.add_argument("--point", nargs=2, type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.point:
         print(json.dumps(point(*args.point)))
         return
     if args.tiles:
-        print(json.dumps(tiles(Path(args.tiles[0]), int(args.tiles[1]), args.tiles[2])))
+        print(json.dumps(tiles(Path(args.tiles[0]), int(args.tiles[1]), args.tiles[2], int(args.tiles[3]))))
         return
-    if args.smoke or args.method == "slope_dls":
-        name = f"large_tiles_{args.surface}_{args.recipe}_{args.tile}"
+    if args.smoke or args.method != "least_squares":
+        recipe = "dls" if args.method == "dls" else args.recipe
+        name = f"large_tiles_{args.surface}_{recipe}_{args.tile}"
         write_json(results_folder(args.smoke) / f"{name}.json", points=measure_tiles(args))
         if not args.smoke:
             return
