@@ -46,7 +46,8 @@ class Places:
     def at(cls, iteration: int, shape: tuple[int, int], size: int, smooth: bool) -> Places:
         """The grid of an iteration."""
         stride = max(1, size // 2)
-        return cls(shape, size, round(iteration * _GOLDEN * stride) % stride, smooth)
+        offset = 0 if shape == (size, size) else round(iteration * _GOLDEN * stride) % stride  # one patch has one place
+        return cls(shape, size, offset, smooth)
 
     def around(self) -> tuple[Places, Tensor, Tensor]:
         """The same grid on a torus, laid out flat.
