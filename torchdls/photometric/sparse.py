@@ -46,7 +46,8 @@ def sparse_normals(
         shadow: leave out samples of at most this part of the pixel's brightest, as `woodham` does; None leaves the
             shadows to the sparse errors.
         prior: "bayes" or "l1".
-        noise: deviation of the dense noise, as a part of the root mean square of the surface's images; positive.
+        noise: deviation of the dense noise, as a part of the root mean square of the surface's images; positive. Of
+            images with noise say so: at 17 dB (.14) and 60 lights normals err by 3.4 degrees with .01, by 2.4 with .2.
         n_iter: iterations, at least 1.
 
     Returns:
