@@ -25,7 +25,7 @@ from torchdls.integrators.piecewise.integrator import _HELD, _Search
 from torchdls.integrators.piecewise.measured import GRAZING, believed, ends, filled, follows_tilt, measure
 from torchdls.integrators.piecewise.pieces import pieces_of, tied_pieces
 from torchdls.integrators.piecewise.prior import NAMES, continued, features, fitted, log_odds
-from torchdls.integrators.piecewise.search import Costs, Problem, energy, robust_weights
+from torchdls.integrators.piecewise.search import Costs, Problem, _safe, energy, out_of_order, robust_weights, search
 
 
 def hinged(n: int = 32) -> tuple[Tensor, Tensor]:
@@ -160,6 +160,25 @@ def test_derivative_is_that_of_the_last_solve_with_weights_and_jumps_held():
     numeric = (held(1e-4) - held(-1e-4)) / 2e-4
     torch.testing.assert_close((found * direction).sum(), numeric, rtol=1e-5, atol=1e-8)
     assert float((held(0.0) - (result.height.detach() * probe).sum()).abs()) < 1e-6
+
+
+def test_jumps_are_out_of_order_where_the_side_that_dives_is_farther():
+    """A ball before a wall has its rim nearer; pushed through it, all jumps of its rim contradict the normals."""
+    gradient, mask, height = ball_before_a_wall()
+    fields = Fields(-gradient, mask, None, None, None, (1.0, 1.0))
+    problem = Problem.of(measure(-gradient, fields, torch.zeros(1)), torch.zeros(1).double(), fields)
+    assert float(out_of_order(problem, -height)) < 0.05
+    behind = torch.where(height > 20, height - 90, height)
+    assert float(out_of_order(problem, -behind)) > 0.9
+
+
+def test_where_jumps_are_out_of_order_the_height_is_that_from_bilateral_for_this_surface_alone():
+    """A plate that floats has no side at which it meets the plane, whichever way it lies; a hinged ramp has one."""
+    both = torch.cat([floating_plate(32)[0], hinged(32)[0]])
+    found, alone = search(problem_of(-both)), search(problem_of(-both[:1]))
+    assert found.doubtful.tolist() == [True, False]
+    torch.testing.assert_close(found.y[:1], _safe(problem_of(-both[:1])), rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(found.cut[:1], alone.cut, rtol=1e-6, atol=1e-6)
 
 
 def test_energy_is_lowered_by_its_reweighted_solves():

@@ -17,7 +17,7 @@ from torchdls.integrators.data_term import Quadratic
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.piecewise.measured import GRAZING, believed, filled, follows_tilt, measure
 from torchdls.integrators.piecewise.pieces import pieces_of, tied_pieces
-from torchdls.integrators.piecewise.search import Problem, odds, search
+from torchdls.integrators.piecewise.search import Found, Problem, odds, search
 from torchdls.integrators.slope_dls import SlopeDLS
 from torchdls.operators import edge_slopes, present_edges
 from torchdls.solvers import solve
@@ -79,15 +79,17 @@ class Piecewise(Iterative[PiecewiseResult]):
 
     1. Noise of the normals is read from the curl of the slopes; where it exceeds 0.9 degrees, the search goes by coded
        normals (`denoise_normals`). The last solve then goes by those that came, linear in their noise, which averages
-       out: coding shrinks what is steep.
+       out: coding shrinks what is steep. Only where step 4 takes `Bilateral` does it stay with the coded ones.
     2. Every edge gets two probabilities of being cut, one for either side being nearer: a logistic regression on the
        angles at which the two normals meet and graze, fitted once on rendered scenes and calibrated on others. So a cut
        has a cost, c = log((1 - P) / P) + log(range / s) - 1, with s the residual that curvature and noise leave.
     3. The energy \sum_e c_e r^2 / (r^2 + s^2), r = A y - v and c that of the side that r makes nearer, is lowered by
-       reweighted solves from two starts: that of `Bilateral`, and least squares with all open that may be cut, with s
-       falling from 4 s to s and costs that fall where contours go on.
-    4. The second is taken where less than a quarter of its jumps are in the less likely order and, without noise, its
-       energy is lower by 2 %. Where the surface jumps, and into which pieces it falls, is read from it in any case.
+       reweighted solves from least squares with all open that may be cut, with s falling from 4 s to s and costs that
+       fall where contours go on; under noise by more of them. What is found tells where the surface jumps, and into
+       which pieces it falls.
+    4. Where a fifth of its jumps or more are clearly in the less likely order, the normals do not tell the order of the
+       sides, and the place of a piece that nothing ties is not believed: the height is then that of six reweighted
+       solves from `Bilateral`.
 
     Where no jump is found, the height is that of `SlopeDLS`, on a field that does not jump; but that of the last solve
     where the noise is found to be one of normals, which makes steep slopes much worse than flat ones. A piece whose
@@ -98,7 +100,8 @@ class Piecewise(Iterative[PiecewiseResult]):
 
     The gradient of log depth needs the focal length, by which slopes are brought to pixels and which tells that depths
     grow away; without one, heights grow towards the viewer. The rule has a scale, one pixel: the method does not scale
-    with the slopes. The work is some 30 to 70 direct factors, in float64; memory as in `solve`.
+    with the slopes. The work is some 10 to 15 direct factors, or 30 to 70 where step 4 takes `Bilateral`, in float64;
+    memory as in `solve`.
 
     Args:
         focal_length: of the camera in pixels, where the gradient is that of log depth; None for heights.
@@ -164,10 +167,10 @@ class Piecewise(Iterative[PiecewiseResult]):
         scale = self._scale
         raw = scale * filled(fields.gradient.double(), fields)
         coded, noise = self._coded(fields, raw)
-        w, d, *found = _Search.apply(
+        w, d, doubtful, *found = _Search.apply(
             coded, raw, fields.mask, fields.weight, fields.anchor, fields.anchor_weight, noise, scale, fields.steps
         )
-        v = self._told(fields, coded, raw, d, noise)
+        v = self._told(fields, coded, raw, d, torch.where(doubtful, 0, noise))
         return self._joined(fields, v / scale, w, d / scale), noise, tuple(found)
 
     def _iterate(self, fields: Fields, callback: Callback | None = None) -> PiecewiseResult:
@@ -240,7 +243,8 @@ class _Search(torch.autograd.Function):
     """Weights, slopes and cuts (N, 2, H, W) of the depth found; nothing of it has a derivative.
 
     Returns:
-        weights and slopes; probability of a cut; (N,) whether none was found; pieces (N, 1, H, W); tied (N, K).
+        weights and slopes; (N,) whether the order is doubtful; probability of a cut; (N,) whether none was found;
+        pieces (N, 1, H, W); tied (N, K).
     """
 
     @staticmethod
@@ -264,15 +268,16 @@ class _Search(torch.autograd.Function):
         live = problem.m.live
         inside = torch.ones_like(p[:, :1], dtype=torch.bool) if mask is None else mask.expand_as(p[:, :1])
         if bool(live.any()):
-            y, w, jump = search(problem)
+            found = search(problem)
         else:
-            y, w, jump = torch.zeros_like(p[:, :1]), torch.zeros_like(p), torch.zeros_like(p)
+            found = Found(torch.zeros_like(p[:, :1]), torch.zeros_like(p), torch.zeros_like(p), noise > 1)
+        y, w, jump, doubtful = found
         cut = jump > 0.5
         smooth = cut.flatten(1).sum(1) < _FEW
         held = torch.zeros_like(inside) if anchor_weight is None else (anchor_weight > 0).expand_as(inside) & inside
         likely = odds(problem).sigmoid().sum(1) > _LIKELY
         pieces = pieces_of(cut & ~smooth[:, None, None, None], likely, live, inside)
-        return w, problem.slopes(y), jump, smooth, pieces, tied_pieces(pieces, live, held)
+        return w, problem.slopes(y), doubtful, jump, smooth, pieces, tied_pieces(pieces, live, held)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
@@ -284,7 +289,7 @@ class _Search(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, *_: Any) -> tuple[None, ...]:
-        return (None,) * 6
+        return (None,) * 7
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:

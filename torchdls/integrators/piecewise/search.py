@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import torch
@@ -13,6 +13,7 @@ from torchdls.integrators.fields import Fields
 from torchdls.integrators.piecewise.measured import Measured
 from torchdls.integrators.piecewise.prior import continued, features, log_odds
 from torchdls.integrators.robust import Bilateral
+from torchdls.integrators.settling import select
 from torchdls.operators import GradientOperator, edge_ends
 from torchdls.solvers.nested_dissection import factor
 
@@ -21,8 +22,8 @@ _LEAST = 1e-12  # weight that a cut edge keeps
 _HOLD = 1e-9  # weight of the present height, as part of the largest of the edges: what nothing holds stays
 _DAMPING = 0.3  # share of the coupled odds
 _JUMP = 2.0  # pixels from which a jump has an order
-_CLEARLY = 0.98  # of another energy, from which one is lower
-_DISORDER = 0.25  # share of jumps in the wrong order from which a surface is not believed
+_CLEARLY = 2.0  # log odds from which one order is likelier
+_DISORDER = 0.2  # share of jumps in the wrong order from which a surface is not believed
 
 
 class Costs(NamedTuple):
@@ -130,7 +131,7 @@ def robust(problem: Problem, y: Tensor, cost: Costs, widths: Iterable[float]) ->
     return y
 
 
-def coupled(problem: Problem, y: Tensor, widths: Iterable[float] = (4, 2, 1, 1), each: int = 2) -> Tensor:
+def coupled(problem: Problem, y: Tensor, widths: Iterable[float] = (4, 2, 1), each: int = 2) -> Tensor:
     """Graduated steps whose costs are those of contours that go on, seen at the present height."""
     for widen in widths:
         cost = costs(problem, odds(problem, y, widen), widen)
@@ -173,35 +174,52 @@ def posterior(problem: Problem, y: Tensor) -> Tensor:
 
 
 def out_of_order(problem: Problem, y: Tensor) -> Tensor:
-    """(N,) share of the jumps above two pixels for which it was more likely, e times, that the other side is nearer."""
+    """(N,) share of the jumps above two pixels whose other side was likelier to be nearer, by a factor of e^2."""
     r = problem.jumps(y)
     i, j = odds(problem).unbind(1)
     cut = problem.m.live & (r.abs() > _JUMP) & (r.abs() > problem.m.scale)
-    wrong = cut & (torch.where(r > 0, j - i, i - j) > 1)
+    wrong = cut & (torch.where(r > 0, j - i, i - j) > _CLEARLY)
     return wrong.flatten(1).sum(1) / cut.flatten(1).sum(1).clamp(min=1)
 
 
 class Found(NamedTuple):
-    """What the search found: depth (N, 1, H, W), weights but for the trusts, probability of a cut (N, 2, H, W)."""
+    """What the search found.
+
+    Attributes:
+        y: (N, 1, H, W) depth.
+        weight: (N, 2, H, W) of the edges, but for the trusts.
+        cut: (N, 2, H, W) probability of a cut.
+        doubtful: (N,) bool, whether the order of the sides is not told.
+    """
 
     y: Tensor
     weight: Tensor
     cut: Tensor
+    doubtful: Tensor
 
 
 def search(problem: Problem) -> Found:
-    """The two starts, the steps from them, and the choice.
+    """The start with all open, the steps from it, and those from `Bilateral` where the first cannot be believed.
 
     Where all that may be cut starts open, jumps are found best, but what hangs together by nothing lies anywhere.
-    Where rims or ties tell the order of the sides, few jumps contradict it; where many do, the one-sided trusts are the
-    safer guess. Otherwise the energy decides, which tells nothing once noise makes most of it. Where the surface jumps,
-    the second start tells in any case.
+    Where rims or ties tell the order of the sides, few jumps contradict it. Where many do, the one-sided trusts are the
+    safer guess, which is looked for only then. The energy does not tell: it is lower for the first in any case. Under
+    noise more steps are of use. Where the surface jumps, the first start tells always.
     """
-    plain = costs(problem, odds(problem))
-    safe = robust(problem, bilateral(problem), plain, [1.0] * 6)
     bold = coupled(problem, opened(problem))
-    lower = energy(problem, bold, plain) < _CLEARLY * energy(problem, safe, plain)
-    chosen = (lower | (problem.noise > 0)) & (out_of_order(problem, bold) < _DISORDER)
-    y = torch.where(_per_surface(chosen), bold, safe)
+    bold = _where(problem.noise > 0, problem, bold, lambda part, y: coupled(part, y, (1, 1, 1)))
+    doubtful = out_of_order(problem, bold) >= _DISORDER
+    y = _where(doubtful, problem, bold, lambda part, _: _safe(part))
     cost = costs(problem, odds(problem, y))
-    return Found(y, robust_weights(problem, y, cost), posterior(problem, bold))
+    return Found(y, robust_weights(problem, y, cost), posterior(problem, bold), doubtful)
+
+
+def _safe(problem: Problem) -> Tensor:
+    return robust(problem, bilateral(problem), costs(problem, odds(problem)), [1.0] * 6)
+
+
+def _where(chosen: Tensor, problem: Problem, y: Tensor, steps: Callable[[Problem, Tensor], Tensor]) -> Tensor:
+    """The depths y, for the surfaces chosen, (N,) bool, replaced by what steps make of them."""
+    if not bool(chosen.any()):
+        return y
+    return y.index_copy(0, chosen.nonzero().flatten(), steps(select(problem, chosen), y[chosen]))
