@@ -196,6 +196,20 @@ def test_black_images_and_constant_scale(method):
     torch.testing.assert_close(scaled.normals, method(images, lights).normals, atol=1e-8, rtol=1e-6)
 
 
+def test_sparse_normals_find_the_noise():
+    """Under noise they are nearly as good as least squares; in a clean scene they take as little for it as they can."""
+    normals, lights, images = scene(20, snr_db=20, generator=seeded(4))
+    found, least, plain = (
+        degrees(m(images, lights).normals, normals).mean()
+        for m in (sparse_normals, lambda i, k: sparse_normals(i, k, noise=0.01), woodham)
+    )
+    assert found < 1.15 * plain < 0.85 * least
+    _, _, clean = scene(20)
+    torch.testing.assert_close(sparse_normals(clean, lights)[0], sparse_normals(clean, lights, noise=0.01)[0])
+    both = torch.cat([images, 9 * clean])  # each surface by its own noise
+    torch.testing.assert_close(sparse_normals(both, lights)[0][:1], sparse_normals(images, lights)[0])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["terrain", "peaks"])
 def test_from_ten_noisy_images_no_default_loses_to_least_squares(name):
@@ -245,7 +259,11 @@ def test_singular_values_are_shrunk():
 
 @pytest.mark.parametrize(
     "method",
-    [woodham, lambda i, k: sparse_normals(i, k, n_iter=4), lambda i, k: sparse_normals(i, k, prior="l1", n_iter=4)],
+    [
+        woodham,
+        lambda i, k: sparse_normals(i, k, noise=0.01, n_iter=4),
+        lambda i, k: sparse_normals(i, k, prior="l1", noise=0.01, n_iter=4),
+    ],
 )
 def test_derivatives(method):
     _, lights, images = scene(12, highlight=0.4, snr_db=30, generator=seeded(9))
