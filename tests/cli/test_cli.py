@@ -247,6 +247,8 @@ def test_a_bad_file_gives_one_line_and_no_output(tmp_path, capsys):
     out = tmp_path / "z.ply"
     assert "bad.png" in fails(capsys, "integrate", tmp_path / "bad.png", "-o", out)
     assert "none.png: No such file" in fails(capsys, "integrate", tmp_path / "none.png", "-o", out)
+    assert "none: no such file or folder" in fails(capsys, "integrate", tmp_path / "none", "-o", out)
+    assert "of photographs: torchdls photometric" in fails(capsys, "integrate", tmp_path, "-o", out)
     assert [p.name for p in tmp_path.iterdir()] == ["bad.png"]
 
 

@@ -211,11 +211,16 @@ def _source(arguments: argparse.Namespace) -> Source:
     """The input, and the mask and camera that lie beside it in a folder; those of the options take their place."""
     from torchdls.batch import Source, folder_source
 
-    if not Path(arguments.input).is_dir():
+    place = Path(arguments.input)
+    if not place.is_dir():
+        if not place.suffix and not place.exists():
+            raise ValueError(f"{place}: no such file or folder")
         return Source(arguments.input, arguments.mask)
     source = folder_source(arguments.input)
     if source is None:
-        raise ValueError(f"{arguments.input}: a folder without normal_map.png; for a folder of maps: torchdls batch")
+        raise ValueError(
+            f"{place}: a folder without normal_map.png; of maps: torchdls batch, of photographs: torchdls photometric"
+        )
     for part in (source.mask if arguments.mask is None else None, source.camera if arguments.camera is None else None):
         if part is not None and not arguments.quiet:
             print(f"{part}: taken from the folder")
