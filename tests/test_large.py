@@ -236,7 +236,7 @@ def test_tiles_are_blended_in_their_slopes_and_solved_once(guard):
             start, height = blended(integrator._exact_runs, part, level, Grid(step), guard is not None)
             slopes[..., rows, columns] += p[:, None] * q * a(height - start)
     smooth = solve(slopes, pixel_size=step).height
-    expected = shrink_slow_waves(smooth, reference, level, step, 24.0)
+    expected = shrink_slow_waves(smooth, reference, level, step)
     expected = expected if guard is None else cautious(expected, reference, smooth, level, step)
     np.testing.assert_allclose(found, expected[0, 0].numpy(), rtol=0, atol=1e-9)
     assert result.tiles == (4, 3)

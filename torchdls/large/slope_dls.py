@@ -9,8 +9,8 @@ added,
 
 with p_t rising over one halo around the middle of an overlap, so that half a halo at the rim of a window counts for
 nothing. The last two steps of SlopeDLS look at the whole again: in the cosine modes of z and of the least-squares
-height the slow waves are shrunk, and where little of the noise was found least squares is returned. One window is
-SlopeDLS.
+height the slow waves are shrunk, and where little of the noise was found least squares is returned. The two iterations
+between these are left out, so one window is SlopeDLS with the recipe "quick".
 """
 
 from __future__ import annotations
@@ -26,13 +26,12 @@ from torch import Tensor
 
 from torchdls._files import Array, as_tensor
 from torchdls.integrators import SlopeDLS
-from torchdls.integrators.slope_dls.runs import Grid, blended, slow_period
-from torchdls.integrators.slope_dls.waves import share_followed, slow_factors, slow_modes
+from torchdls.integrators.slope_dls.runs import PERIOD, Grid, blended
+from torchdls.integrators.slope_dls.waves import share_followed, shrunk_modes, slow_part
 from torchdls.large.transform import (
     Passes,
     columns_back,
     columns_forward,
-    eigenvalues,
     integrated,
     rows_back,
     rows_forward,
@@ -81,13 +80,13 @@ def slope_dls(passes: Passes, integrator: SlopeDLS, windows: Windows, level: Ten
     for rows in passes.bands():
         base[rows] = rows_forward(passes.divergence(rows, steps))
         change[rows] = rows_forward(as_tensor(change[rows]))
-    factors, share = _finish(passes, base, change, level, steps, slow_period(integrator._exact_runs))
+    shrunk, share = _finish(passes, base, change, level, steps)
     share = 1.0 if integrator.guard is None else share
     for columns in passes.strips():
         z, d = (as_tensor(x[:, columns].T) for x in (base, change))
         smooth = z + d
-        slow = factors[:, columns].T
-        smooth[: len(slow), : slow.shape[1]] *= slow
+        slow = shrunk[:, columns].T
+        smooth[: len(slow), : slow.shape[1]] = slow
         base[:, columns] = columns_back(z + share * (smooth - z))
     for rows in passes.bands():
         yield rows, rows_back(base[rows]) * unit
@@ -133,13 +132,13 @@ def _smooth(
 
 
 def _finish(
-    passes: Passes, base: Array, change: Array, level: Tensor, steps: tuple[float, float], period: float
+    passes: Passes, base: Array, change: Array, level: Tensor, steps: tuple[float, float]
 ) -> tuple[Tensor, float]:
     """Strips of columns from A^T v to the spectrum of heights, in place; `shrink_slow_waves` and `cautious` from it.
 
     Returns:
-        The factors (rows, columns) of the first modes, which hold the slow waves, and the share of the change that is
-        followed.
+        The first modes (rows, columns) of the smoothed height, which hold the slow waves, these shrunk, and the share
+        of the change that is followed.
     """
     (h, w), removed, energy = passes.size, 0.0, 0.0
     for columns in passes.strips():
@@ -149,12 +148,9 @@ def _finish(
         weight = torch.where(variance > 0, variance, math.inf).pow_(-0.25)
         removed += float((weight * as_tensor(change[:, columns]).square()).sum())
         energy += float(weight.mul_(torch.where(variance > 0, variance, 0)).sum())
-    part = (min(h, math.ceil(2 * h / period)), min(w, math.ceil(2 * w / period)))
-    z = as_tensor(base[: part[0], : part[1]])
-    y, x = eigenvalues((h, w), slice(0, part[0]), slice(0, part[1]), steps)
-    energies = y[:, None] + x
-    noise = (level.square() * height_noise_part((h, w), (0, part[0]), (0, part[1]), steps) * energies).to(z)
-    slow = slow_modes(part, (h, w), period, z)
-    factors = slow_factors((z.square() * energies.to(z))[None, None], noise[None, None], slow)[0, 0]
+    rows, across = slow_part((h, w), PERIOD)
+    z, d = (as_tensor(x[:rows, :across])[None, None] for x in (base, change))
+    noise = (level.square() * height_noise_part((h, w), (0, rows), (0, across), steps)).to(z)
+    shrunk = shrunk_modes(z + d, z, noise[None, None], (h, w), steps, PERIOD)[0, 0]
     share = share_followed(torch.tensor([removed], dtype=torch.float64), level.double().square() * energy)
-    return factors, float(share)
+    return shrunk, float(share)

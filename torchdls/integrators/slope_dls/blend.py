@@ -12,8 +12,8 @@ from torchdls.noise import height_noise
 from torchdls.operators.modes import Boundary, from_modes, to_modes
 from torchdls.operators.tables import table
 
-_PERIOD = 32.0  # of the slow waves, in pixels
-_SHARED = 0.2  # of the risk of the other part
+_PERIOD = 16.0  # of the slow waves, in pixels
+_SHARED = 0.1  # of the risk of the other part
 
 
 def signs(like: Tensor) -> Tensor:
@@ -79,11 +79,12 @@ def blend_by_waves(
     norm: float = 0.5,
     boundary: Boundary = "neumann",
 ) -> Tensor:
-    r"""z_ls + sum_m w_m (z_m - z_ls), with weights of their own for the slow waves (period above 32) and the others.
+    r"""z_ls + sum_m w_m (z_m - z_ls), with weights of their own for the slow waves (period above 16) and the others.
 
     What sees the slow waves best need not be best in the fine ones. Each part has the weights of `sure_weights` for its
-    own risk, to which a fifth of that of the other part is added: few modes make it scatter. Where little of the noise
-    of the fine waves was found, as on texture, they return to least squares: their part of the sum counts
+    own risk, over that of least squares, to which a tenth of that of the other part is added: few modes make it
+    scatter. Where little of the noise of the fine waves was found, as on texture, they return to least squares: their
+    part of the sum counts
 
         r = clip(5 q - 2, 0, 1) times,   q = sum |D|^2 S^-3/4 / (sigma^2 sum S^1/4)   over the fine waves
 
@@ -105,10 +106,16 @@ def blend_by_waves(
     slow = slow_modes(shape, shape, _PERIOD, reference, boundary)
     D, push, change = (to_modes(t, boundary) for t in (heights - reference, moved, changes - moved))
     parts = slow, ~slow
-    risks = [_risk(D.detach(), push, change, torch.where(part, weight, 0), noise) for part in parts]
+    variance = height_noise(shape, reference, pixel_size, boundary)
+    risks = []
+    for part in parts:
+        counted = torch.where(part, weight, 0)
+        plain = (counted * variance).sum()
+        G, b = _risk(D.detach(), push, change, counted / torch.where(plain > 0, plain, 1), noise)
+        risks.append((G, b))
     blends = []
     for own, other in zip(risks, reversed(risks), strict=True):
-        w = _least_risk(*(a + _SHARED * b for a, b in zip(own, other, strict=True))).to(reference)
+        w = _least_risk(*(x + _SHARED * y for x, y in zip(own, other, strict=True))).to(reference)
         blends.append((w.mT[:, :, None, None, None] * D).sum(0))
     fine = torch.where(slow, 0, _weight(reference, pixel_size, 0.75, boundary))
     expected = noise.detach().square() * torch.where(slow, 0, _weight(reference, pixel_size, -0.25, boundary)).sum()

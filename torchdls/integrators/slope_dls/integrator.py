@@ -102,9 +102,10 @@ class SlopeDLS(Iterative[SlopeDLSResult]):
     "blend" does so in four ways (along rows and columns, along the diagonals, with equal weights, and with small
     patches alone), and blends the four heights by Stein's unbiased risk estimate from a second round on probed data,
     slow waves and the others with weights of their own.
-    At last, cosine modes of the height of periods above 32 pixels, which patches hardly see, are shrunk
-    (`shrink_slow_waves`), and where little of the noise was found, as on texture, least squares is returned
-    (`cautious`). "quick" is one run of 6 iterations with equal weights, about a tenth of the work.
+    Then waves of periods above 16 pixels, which patches hardly see, are shrunk in cosines and in polynomials of the
+    position (`shrink_slow_waves`); the first of the four ways goes on from there for two iterations (tau 0.5 and 0.4,
+    without step 4); and where little of the noise was found, as on texture, least squares is returned (`cautious`).
+    "quick" is one run of 6 iterations with equal weights, its slow waves shrunk, about a tenth of the work.
 
     Surfaces with a mask, unequal weights or anchors go through one run with equal weights ("quick": of 4 iterations).
     Slopes outside the mask are filled by the last estimate u (at first by those of the harmonic extension). Patches

@@ -25,7 +25,8 @@ from torchdls.selection import discrepancy_guard
 from torchdls.solvers import solve
 from torchdls.solvers.periodic import solve_periodic
 
-_PERIODS = (24.0, 32.0)  # pixels: the waves to shrink are longer, after one run and after a blend
+PERIOD = 16.0  # pixels: the waves to shrink are longer
+_LAST = (0.5, 0.4)  # thresholds of two iterations after a blend
 KAPPA = 25.0  # trust in the coded slopes, as a multiple of that in the measured ones
 
 
@@ -242,6 +243,8 @@ def smooth(
 ) -> Tensor:
     """The height of one run, or of several blended by SURE; then its slow waves shrunk, and least squares kept in mind.
 
+    After a blend the first of the runs goes on from there for two iterations.
+
     Args:
         runs: one or several.
         gradient: (N, 2, H, W), full rectangles with equal trust.
@@ -255,13 +258,20 @@ def smooth(
         shrinkage held fixed.
     """
     start, blend = blended(runs, gradient, noise, grid, guard, watch)
-    height = shrink_slow_waves(blend, start, noise, grid.steps, slow_period(runs), grid.boundary)
+    height = shrink_slow_waves(blend, start, noise, grid.steps, PERIOD, grid.boundary)
+    height = _polished(runs[0], height, gradient, noise, grid) if len(runs) > 1 else height
     return cautious(height, start, blend, noise, grid.steps, boundary=grid.boundary) if guard else height
 
 
-def slow_period(runs: Sequence[Run]) -> float:
-    """The shortest period in pixels of the waves that are shrunk after these runs."""
-    return _PERIODS[len(runs) > 1]
+def _polished(run: Run, z: Tensor, gradient: Tensor, noise: Tensor, grid: Grid) -> Tensor:
+    """Two more iterations from a height whose waves, slow ones too, were seen to."""
+    falling = run.tau[0] > run.tau[1]
+    last = replace(run, n_iter=min(run.n_iter, len(_LAST)), tau=_LAST if falling else run.tau)
+    v = grid.slopes(gradient)
+    for iteration in range(last.n_iter):
+        coded = last.code(grid.differences(z), noise, grid.steps, iteration, boundary=grid.boundary)
+        z = grid.solve((v + KAPPA * coded) / (1 + KAPPA))
+    return z
 
 
 def blended(

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from torchdls._checks import check_alike, check_field, check_fit
 from torchdls._precision import full_precision
-from torchdls.noise import height_noise
+from torchdls.noise import height_noise, height_noise_part
 from torchdls.operators import dct2, idct2
-from torchdls.operators.modes import Boundary, half_periods, mode_eigenvalues, to_modes
+from torchdls.operators.modes import Boundary, half_periods, to_modes
+from torchdls.operators.tables import table
 
 _THRESHOLDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)
-_TEMPERATURE = 8.0  # of the mean over the thresholds, in units of the noise of one mode: few modes make SURE scatter
+_DEGREES = (0, 4, 8)  # of the polynomials before cosines
+_BOX = 48  # modes along each axis of which polynomials are made: they hold hardly anything of finer ones
+_TEMPERATURE = 8.0  # of the mean over bases and thresholds, in units of the noise of one mode: SURE of few scatters
 _LEAST_CUT = 0.2  # share of the risk of least squares that must go, as predicted, for anything to be changed
 
 
@@ -22,18 +29,22 @@ def shrink_slow_waves(
     reference: Tensor,
     noise: Tensor,
     pixel_size: tuple[float, float] = (1.0, 1.0),
-    period: float = 32.0,
+    period: float = 16.0,
     boundary: Boundary = "neumann",
 ) -> Tensor:
-    r"""Shrink the cosine modes of long period by what their least-squares coefficients say of signal and noise.
+    r"""Shrink what a height holds of long waves by what least squares says of their signal and noise.
 
-        C_k -> f_k C_k,   f_k = sum_T p_T max(0, 1 - T^2 s_k^2 / x_k^2),   p_T ~ exp(-R_T / 8)
-        R_T = sum_k (min(x^2, T^4 s^4 / x^2) + 2 s^2 (1 + T^2 s^2 / x^2) [|x| > T s] - s^2) / s^2
+        y -> sum_BT p_BT (y shrunk in B with threshold T),   p_BT ~ exp(-R_BT / 8)
+        c_k -> f_k c_k,   f_k = max(0, 1 - T^2 v_k / c_k^2)
+        R_BT = ||y' - y||^2 + 2 sum_k v_k (1 + T^2 v_k / c_k^2) [c_k^2 > T^2 v_k] - K
 
-    x_k is the coefficient of mode k in the orthonormal basis of the fields that have a surface (L_k^(1/2) dct2(z_ls)_k,
-    L_k the eigenvalue of the Laplacian), s_k its noise; R_T is Stein's unbiased estimate of the risk of threshold T,
-    with s_k^2 in the denominator replaced by its mean. The thresholds 0, 1/2, .. 5/2 are averaged rather than chosen
-    among, since the risk of few modes scatters. `SlopeDLS` ends with it; any other height of patches gains too.
+    y are the cosine modes of long period of the least-squares height, K of them, each over its noise: white noise of
+    variance 1. Shrunk, they are y'; the modes of `height` take the same factors. A basis B is either the cosines
+    themselves (c = y, v = 1), or polynomials of the position up to degree 4 or 8, orthonormal in y, and the cosines of
+    what is left: c = U^T y with v = 1, and y - U c with v_k = 1 - sum_p U_kp^2, from which polynomials are taken out
+    again when it is shrunk. Polynomials are few where a surface is smooth and bends up to the border. R_BT is Stein's
+    unbiased estimate of the risk. Bases and thresholds 0, 1/2, .. 5/2 are averaged rather than chosen among, since the
+    risk of few modes scatters. `SlopeDLS` ends with it; any other height of patches gains too.
 
     Args:
         height: (N, 1, H, W), on a full rectangle.
@@ -42,10 +53,11 @@ def shrink_slow_waves(
         pixel_size: (dx, dy).
         period: in pixels; modes of longer period are shrunk.
         boundary: "neumann", or "periodic" for a surface that repeats. Its modes are those of the Fourier transform, of
-            two coefficients each: x_k^2 is their mean square, and (1 + T^2 s^2 / x^2) in R_T becomes 1.
+            two coefficients each: y_k^2 is their mean square, (1 + T^2 v / c^2) in R becomes 1, and there are no
+            polynomials.
 
     Returns:
-        (N, 1, H, W); differentiable, with the p_T held fixed.
+        (N, 1, H, W); differentiable, with the p_BT held fixed.
 
     Raises:
         TypeError: a tensor is not float32 or float64, or they differ in it.
@@ -69,32 +81,156 @@ def shrink_slow_waves(
         shapes = f"height {tuple(height.shape)} and noise {tuple(noise.shape)}"
         raise ValueError(f"shrink_slow_waves: {shapes} given, (N, 1, H, W) and (N,) are needed")
     shape = (height.shape[-2], height.shape[-1])
-    slow = slow_modes(shape, shape, period, height, boundary)
-    eigenvalue = mode_eigenvalues(shape, height, pixel_size, boundary)
-    s2 = noise.square()[:, None, None, None] * height_noise(shape, height, pixel_size, boundary) * eigenvalue
+    variance = noise.square()[:, None, None, None] * height_noise(shape, height, pixel_size, boundary)
     if boundary == "periodic":  # a sine and a cosine share their fate, or waves would shift
-        x2 = _power(torch.fft.fft2(reference, norm="ortho")) * eigenvalue
-        return torch.fft.ifft2(torch.fft.fft2(height) * slow_factors(x2, s2, slow, two=True)).real
-    x2 = dct2(reference).square() * eigenvalue
-    return idct2(dct2(height) * slow_factors(x2, s2, slow))
+        slow = slow_modes(shape, shape, period, height, boundary)
+        factors = _torus_factors(torch.fft.fft2(reference, norm="ortho"), variance, slow)
+        return torch.fft.ifft2(torch.fft.fft2(height) * factors).real
+    modes, (h, w) = dct2(height), slow_part(shape, period)
+    part = (..., slice(h), slice(w))
+    shrunk = shrunk_modes(modes[part], dct2(reference)[part], variance[part], shape, pixel_size, period)
+    return idct2(modes + functional.pad(shrunk - modes[part], (0, shape[1] - w, 0, shape[0] - h)))
 
 
-def slow_factors(x2: Tensor, s2: Tensor, slow: Tensor, two: bool = False) -> Tensor:
-    """f_k of `shrink_slow_waves`, 1 for modes that are not slow.
+def slow_part(shape: tuple[int, int], period: float) -> tuple[int, int]:
+    """(h, w) of the first cosine modes of a surface (H, W), which hold all of longer period."""
+    h, w = (max(1, min(n, math.ceil(2 * n / period))) for n in shape)
+    return h, w
+
+
+def shrunk_modes(
+    height: Tensor,
+    reference: Tensor,
+    variance: Tensor,
+    shape: tuple[int, int],
+    pixel_size: tuple[float, float],
+    period: float,
+) -> Tensor:
+    """`shrink_slow_waves` of the first cosine modes, which hold the slow ones.
 
     Args:
-        x2: (N, 1, h, w) squares of the coefficients, of all modes or of the first ones that hold all slow ones.
-        s2: (N, 1, h, w), their variances.
-        slow: (h, w) bool.
-        two: whether each mode has two coefficients.
+        height: (N, 1, h, w) modes, those of `slow_part`.
+        reference: (N, 1, h, w), those of least squares.
+        variance: (N, 1, h, w) of the noise of the reference's.
+        shape: (H, W) of the surface.
+        pixel_size: (dx, dy).
+        period: in pixels.
+
+    Returns:
+        (N, 1, h, w).
     """
-    seen = slow & (x2 > 0)
-    ratio = torch.where(seen, s2 / torch.where(seen, x2, 1), 0)
-    risks = torch.stack([_risk(x2.detach(), s2.detach(), ratio.detach(), slow, t, two) for t in _THRESHOLDS])
-    share = torch.softmax(-risks / _TEMPERATURE, 0)
-    factor = torch.stack([(1 - t * t * ratio).clamp(min=0) for t in _THRESHOLDS])
-    mean = (share[..., None, None, None] * factor).sum(0)
-    return torch.where(slow, mean, 1)
+    part = (height.shape[-2], height.shape[-1])
+    slow = slow_modes(part, shape, period, height) & (variance > 0)
+    scale = torch.where(slow, variance, 1).sqrt()
+    y, z = (torch.where(slow, x / scale, 0) for x in (reference, height))
+    shrunk, risks = [], []
+    for degree in _DEGREES:
+        atoms, left = _polynomials(shape, part, degree, tuple(pixel_size), period, like=height)
+        basis = _Basis(atoms, left, _box(part))
+        for threshold in _THRESHOLDS:
+            found, risk = basis.shrunk(z, y, threshold)
+            shrunk.append(found)
+            risks.append(risk)
+    share = torch.softmax(-torch.stack(risks) / _TEMPERATURE, 0)
+    mean = (share[..., None, None, None] * torch.stack(shrunk)).sum(0)
+    return torch.where(slow, mean * scale, height)
+
+
+class _Basis(NamedTuple):
+    """Polynomials, and the cosines for what they leave.
+
+    Attributes:
+        atoms: (a b, P) orthonormal polynomials, as white modes.
+        left: (h, w) v of the modes of the remainder.
+        box: (a, b) of the first modes, of which the atoms are.
+    """
+
+    atoms: Tensor
+    left: Tensor
+    box: tuple[int, int]
+
+    def along(self, y: Tensor) -> Tensor:
+        """(N, 1, h, w) -> (N, P)."""
+        a, b = self.box
+        return y[..., :a, :b].flatten(1) @ self.atoms
+
+    def sum(self, c: Tensor) -> Tensor:
+        """(N, P) -> (N, 1, h, w), the transpose of `along`."""
+        (h, w), (a, b) = self.left.shape, self.box
+        return functional.pad((c @ self.atoms.mT).view(-1, 1, a, b), (0, w - b, 0, h - a))
+
+    def shrunk(self, z: Tensor, y: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
+        """The modes z (N, 1, h, w) with the factors that the white modes y ask for, and R (N,) of y + K."""
+        c = self.along(y)
+        rest = y - self.sum(c)
+        f, slope = _factors(c, torch.ones_like(c), threshold)
+        g, slopes = _factors(rest, self.left, threshold)
+
+        def followed(z: Tensor) -> Tensor:
+            along = self.along(z)
+            rest = g * (z - self.sum(along))
+            return rest + self.sum(f * along - self.along(rest))
+
+        risk = (followed(y) - y).detach().square().sum((1, 2, 3)) + 2 * (slope.sum(1) + slopes.sum((1, 2, 3)))
+        return followed(z), risk
+
+
+def _factors(c: Tensor, v: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
+    """max(0, 1 - T^2 v / c^2), and without a derivative v times that of c times it."""
+    cut = threshold * threshold * v
+    above = c.square() > cut
+    ratio = torch.where(above, cut / torch.where(above, c.square(), 1), 1)
+    return 1 - ratio, torch.where(above, v * (1 + ratio), 0).detach()
+
+
+@table
+def _polynomials(
+    shape: tuple[int, int], part: tuple[int, int], degree: int, pixel_size: tuple[float, float], period: float
+) -> tuple[Tensor, Tensor]:
+    """`atoms` and `left` of a `_Basis` of at most half as many polynomials as there are slow modes."""
+    a, b = box = _box(part)
+    most = math.pi * shape[0] * shape[1] / (2 * period * period)
+    degree = max(d for d in range(degree + 1) if d == 0 or d * (d + 3) / 2 <= most)
+    y, x = (_legendre(n, k, min(degree, k - 1)) for n, k in zip(shape, box, strict=True))
+    pairs = [(i, d - i) for d in range(1, degree + 1) for i in range(d + 1) if i < y.shape[1] and d - i < x.shape[1]]
+    variance = height_noise_part(shape, (0, a), (0, b), pixel_size)
+    slow = slow_modes(box, shape, period, variance)
+    white = torch.where(slow, torch.where(slow, variance, 1).rsqrt(), 0)
+    found = [(white * y[:, i, None] * x[:, j]).flatten() for i, j in pairs]
+    atoms = torch.linalg.qr(torch.stack(found, 1))[0] if found else white.new_zeros(a * b, 0)
+    left = torch.where(slow, (1 - atoms.square().sum(1)).clamp(min=0).view(a, b), 0)
+    return atoms, functional.pad(left, (0, part[1] - b, 0, part[0] - a), value=1.0)
+
+
+def _legendre(n: int, modes: int, degree: int) -> Tensor:
+    """(modes, degree + 1) first cosine coefficients of the Legendre polynomials on n pixels."""
+    position = (torch.arange(n, dtype=torch.float64, device="cpu") + 0.5) / n
+    cosines = torch.cos(math.pi * torch.arange(modes, dtype=torch.float64, device="cpu")[:, None] * position)
+    cosines[:1] *= math.sqrt(0.5)  # all modes have length 1, but for a common factor
+    t, found = 2 * position - 1, [torch.ones_like(position), 2 * position - 1]
+    for k in range(1, degree):
+        found.append(((2 * k + 1) * t * found[k] - k * found[k - 1]) / (k + 1))
+    return cosines @ torch.stack(found[: degree + 1], 1)
+
+
+def _box(part: tuple[int, int]) -> tuple[int, int]:
+    return min(part[0], _BOX), min(part[1], _BOX)
+
+
+def _torus_factors(reference: Tensor, variance: Tensor, slow: Tensor) -> Tensor:
+    """f_k of `shrink_slow_waves` on a torus, 1 for modes that are not slow: (N, 1, H, W), of complex modes."""
+    seen = slow & (variance > 0)
+    power = reference.real.square() + reference.imag.square()
+    y2 = torch.where(seen, power / torch.where(seen, variance, 1), 0)
+    factors, risks = [], []
+    for threshold in _THRESHOLDS:
+        above = y2 > threshold * threshold
+        f = torch.where(above, 1 - threshold * threshold / torch.where(above, y2, 1), 0)
+        factors.append(f)
+        risks.append((((1 - f).square() * y2).detach() + torch.where(above, 2, 0)).sum((1, 2, 3)))
+    share = torch.softmax(-torch.stack(risks) / _TEMPERATURE, 0)
+    mean = (share[..., None, None, None] * torch.stack(factors)).sum(0)
+    return torch.where(seen, mean, 1)
 
 
 def cautious(
@@ -150,20 +286,3 @@ def slow_modes(
     )
     frequency = (rows.square()[:, None] + columns.square()).sqrt()
     return (frequency > 0) & (frequency < 1 / period)
-
-
-def _power(spectrum: Tensor) -> Tensor:
-    return spectrum.real.square() + spectrum.imag.square()
-
-
-def _risk(x2: Tensor, s2: Tensor, ratio: Tensor, slow: Tensor, threshold: float, two: bool = False) -> Tensor:
-    """(N,) Stein's estimate over the slow modes, in units of their mean noise; of one coefficient each, or of two."""
-    t2 = threshold * threshold
-    above = t2 * ratio < 1
-    loss = (
-        torch.where(above, t2 * t2 * s2 * ratio, x2)
-        + torch.where(above, 2 * s2 * (1 + (0 if two else t2 * ratio)), 0)
-        - s2
-    )
-    total = (slow * s2).sum((-3, -2, -1)) / slow.sum().clamp(min=1)
-    return (slow * loss).sum((-3, -2, -1)) / torch.where(total > 0, total, 1)
