@@ -29,7 +29,7 @@ DOCUMENTED = (
     "no cell",
     "without any valid pixel",
 )
-LIMIT = 60.0  # seconds after which a call counts as hanging
+LIMIT = 60.0  # seconds of processor time after which a call counts as hanging
 
 
 class Flaw(AssertionError):
@@ -171,13 +171,13 @@ def bounded() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
         yield
         return
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, LIMIT)
+    before = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, LIMIT)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
 
 
 def numbered(seed: int, i: int) -> random.Random:

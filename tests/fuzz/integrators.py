@@ -23,9 +23,10 @@ WRONG_TENSORS = ["None", "[1.0]", "'x'", "{}.numpy()", "{}.half()", "{}.long()",
                  "{}[0, 0]", "torch.stack([{}, {}])", "{}.to('meta')"]  # fmt: skip
 # What METHODS promises on the images of its tests alone.
 NO = {
-    # Of edges that are equal, as those along a straight jump, the tree and the release take the first.
+    # Of edges that are equal, as those along a straight jump or wave, the trees and the release take the first.
     "alpha_surface": ["follows_flips", "follows_a_transpose"],
     "partial_integrability": ["follows_flips", "follows_a_transpose"],
+    "spectral_path": ["follows_flips", "follows_a_transpose"],
     "dls": ["follows_flips"],  # the grid of its patches shifts where the stride does not fit the image
     "slope_dls": ["carries_offsets"],  # its patches span the gaps between the components of a mask
 }
