@@ -8,9 +8,11 @@ added,
     z = argmin ||A z - v - sum_t p_t A d_t||^2,      sum_t p_t = 1
 
 with p_t rising over one halo around the middle of an overlap, so that half a halo at the rim of a window counts for
-nothing. The last two steps of SlopeDLS look at the whole again: in the cosine modes of z and of the least-squares
-height the slow waves are shrunk, and where little of the noise was found least squares is returned. The two iterations
-between these are left out, so one window is SlopeDLS with the recipe "quick".
+nothing. Waves as long as a window are seen by none: they are those of the whole at a lower resolution, at which it is
+no larger than a window. There slopes are means over blocks, with less noise, and the modes of d that are longer than a
+quarter of a window come from there. The last steps of SlopeDLS look at the whole again: in the cosine modes of z and of
+the least-squares height the slow waves are shrunk, and where little of the noise was found least squares is returned.
+The two iterations between these are left out, so one window is SlopeDLS with the recipe "quick".
 """
 
 from __future__ import annotations
@@ -23,11 +25,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from torchdls._files import Array, as_tensor
 from torchdls.integrators import SlopeDLS
 from torchdls.integrators.slope_dls.runs import PERIOD, Grid, blended
-from torchdls.integrators.slope_dls.waves import share_followed, shrunk_modes, slow_part
+from torchdls.integrators.slope_dls.waves import share_followed, shrunk_modes, slow_modes, slow_part
 from torchdls.large.transform import (
     Passes,
     columns_back,
@@ -37,9 +40,10 @@ from torchdls.large.transform import (
     rows_forward,
 )
 from torchdls.noise import height_noise_part, noise_if_told
-from torchdls.operators import GradientOperator
+from torchdls.operators import GradientOperator, dct2
 
 HALO = 64  # pixels
+_NARROW = 8  # pixels that a side must have at the lower resolution
 
 
 class Span(NamedTuple):
@@ -77,10 +81,11 @@ def slope_dls(passes: Passes, integrator: SlopeDLS, windows: Windows, level: Ten
     unit, steps = in_pixels(passes.step)
     base, change = passes.scratch("base"), passes.scratch("change")
     _smooth(passes, integrator, windows, level, steps, change)
+    waves = long_waves(passes, integrator, windows, level, steps)
     for rows in passes.bands():
         base[rows] = rows_forward(passes.divergence(rows, steps))
         change[rows] = rows_forward(as_tensor(change[rows]))
-    shrunk, share = _finish(passes, base, change, level, steps)
+    shrunk, share = _finish(passes, base, change, level, steps, waves)
     share = 1.0 if integrator.guard is None else share
     for columns in passes.strips():
         z, d = (as_tensor(x[:, columns].T) for x in (base, change))
@@ -131,8 +136,47 @@ def _smooth(
             change[down.pixels, across.pixels] += a.adjoint(weight * a(height - start))[0, 0].numpy()
 
 
+class Waves(NamedTuple):
+    """The first modes (h, w) of a change, and which of them are meant."""
+
+    modes: Array
+    chosen: Array
+
+    def put(self, change: Array, columns: slice) -> None:
+        """In the place of those of a strip."""
+        (h, _), part = self.modes.shape, slice(columns.start, columns.stop)
+        own, chosen = change[:h, : self.modes.shape[1]][:, part], self.chosen[:, part]
+        own[chosen] = self.modes[:, part][chosen]
+
+
+def long_waves(
+    passes: Passes, integrator: SlopeDLS, windows: Windows, level: Tensor, steps: tuple[float, float]
+) -> Waves | None:
+    """The modes that are too long for a window, of the change of the whole at a lower resolution.
+
+    None where one window is all, or the surface is so narrow that nothing would be left.
+    """
+    (h, w), sides = passes.size, [span[0].pixels.stop - span[0].pixels.start for span in windows]
+    fold = max(2, *(math.ceil(n / side) for n, side in zip((h, w), sides, strict=True)))
+    low = math.ceil(h / fold), math.ceil(w / fold)
+    if len(windows[0]) == len(windows[1]) == 1 or min(low) < _NARROW:
+        return None
+    passes.say(f"the whole at {low[0]} x {low[1]}")
+    blocks = [slice(i * h // low[0], -(-(i + 1) * h // low[0])) for i in range(low[0])]
+    means = [functional.adaptive_avg_pool1d(passes.field.slopes(rows).mean(1), low[1]) for rows in blocks]
+    unit, wide = in_pixels((steps[0] * w / low[1], steps[1] * h / low[0]))
+    area = h * w / (low[0] * low[1])
+    guard = integrator.guard is not None
+    start, height = blended(
+        integrator._exact_runs, torch.stack(means, 1)[None], level / math.sqrt(area), Grid(wide), guard
+    )
+    modes = dct2(height - start)[0, 0] * (unit * math.sqrt(area))
+    period = max(max(sides) / 4, 8.0 * fold)
+    return Waves(modes.numpy(), slow_modes(low, (h, w), period, modes).numpy())
+
+
 def _finish(
-    passes: Passes, base: Array, change: Array, level: Tensor, steps: tuple[float, float]
+    passes: Passes, base: Array, change: Array, level: Tensor, steps: tuple[float, float], waves: Waves | None
 ) -> tuple[Tensor, float]:
     """Strips of columns from A^T v to the spectrum of heights, in place; `shrink_slow_waves` and `cautious` from it.
 
@@ -144,6 +188,8 @@ def _finish(
     for columns in passes.strips():
         for array in (base, change):
             array[:, columns] = integrated(columns_forward(array[:, columns]), columns, (h, w), steps).T.numpy()
+        if waves is not None:
+            waves.put(change, columns)
         variance = height_noise_part((h, w), (0, h), (columns.start, columns.stop), steps)
         weight = torch.where(variance > 0, variance, math.inf).pow_(-0.25)
         removed += float((weight * as_tensor(change[:, columns]).square()).sum())
