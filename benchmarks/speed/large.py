@@ -13,6 +13,7 @@ import json
 import tempfile
 import threading
 import time
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -75,10 +76,10 @@ def point(n: int, megabytes: int) -> dict[str, Any]:
     return row
 
 
-def write_surface(folder: Path, name: str, n: int) -> None:
+def write_surface(folder: Path, name: str, n: int, draw: int) -> None:
     """A surface with noise of 5 dB, and its heights."""
     surface = SURFACES[name](n, dtype=torch.float32)
-    noisy = add_noise(surface.gradient, 5, torch.Generator().manual_seed(0))
+    noisy = add_noise(surface.gradient, 5, torch.Generator().manual_seed(draw))
     np.save(folder / "g.npy", noisy[0].numpy())
     np.save(folder / "true.npy", surface.height[0, 0].numpy())
 
@@ -117,14 +118,14 @@ def deviation(height: np.ndarray[Any, Any], true: np.ndarray[Any, Any]) -> float
 
 def measure_tiles(args: argparse.Namespace) -> list[dict[str, Any]]:
     rows = []
-    for n in [96] if args.smoke else args.sizes:
+    for n, draw in product([96] if args.smoke else args.sizes, range(args.draws)):
         with tempfile.TemporaryDirectory() as folder:
-            write_surface(Path(folder), args.surface, n)
+            write_surface(Path(folder), args.surface, n, draw)
             tile = 16 if args.smoke else args.tile
             recipe = f"dls{args.iterations}" if args.method == "dls" else args.recipe
             given = folder, str(tile), recipe, str(args.whole)
             said = fresh_process("benchmarks.speed.large", "--tiles", *given)
-        rows.append({"surface": args.surface} | json.loads(said.splitlines()[-1]))
+        rows.append({"surface": args.surface, "draw": draw} | json.loads(said.splitlines()[-1]))
         print(rows[-1], flush=True)
     return rows
 
@@ -139,6 +140,7 @@ def main() -> None:
     parser.add_argument("--tile", type=int, default=512, help="of slope_dls and dls")
     parser.add_argument("--recipe", choices=("blend", "quick"), default="quick", help="of slope_dls")
     parser.add_argument("--iterations", type=int, default=3, help="of dls")
+    parser.add_argument("--draws", type=int, default=1, help="of the noise, each as above")
     parser.add_argument("--whole", type=int, default=1024, help="the largest size that is made whole as well")
     parser.add_argument("--tiles", nargs=4, help=argparse.SUPPRESS)
     parser.add_argument("--point", nargs=2, type=int, help=argparse.SUPPRESS)
@@ -151,7 +153,7 @@ def main() -> None:
         return
     if args.smoke or args.method != "least_squares":
         recipe = "dls" if args.method == "dls" else args.recipe
-        name = f"large_tiles_{args.surface}_{recipe}_{args.tile}"
+        name = f"large_tiles_{args.surface}_{recipe}_{args.tile}" + "_draws" * (args.draws > 1)
         write_json(results_folder(args.smoke) / f"{name}.json", points=measure_tiles(args))
         if not args.smoke:
             return
