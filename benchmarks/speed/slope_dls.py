@@ -52,6 +52,7 @@ def forward(size: int, turns: int) -> dict[str, Any]:
         "DLS(15)": lambda: dls(g),
         "DLS(15), PyTorch alone": lambda: _alone(lambda: dls(g)),
         "SlopeDLS": lambda: SlopeDLS()(g),
+        "SlopeDLS, PyTorch alone": lambda: _alone(lambda: SlopeDLS()(g)),
         "fast": lambda: SlopeDLS.fast()(g),
         "disk": lambda: SlopeDLS()(g, mask),
         "disk, LeastSquares": lambda: LeastSquares()(g, mask),
@@ -70,12 +71,12 @@ def training(size: int, turns: int) -> dict[str, Any]:
 
 
 def memory(size: int) -> float:
-    """Kilobytes a pixel beyond what a small call takes, in this process."""
+    """Megabytes beyond what a small call takes, in this process."""
     with torch.no_grad():
-        SlopeDLS()(noisy(16, torch.float32))
+        SlopeDLS()(noisy(64, torch.float32))  # loads the compiled loops
         g, start = noisy(size, torch.float32), peak_megabytes()
         SlopeDLS()(g)
-    return (peak_megabytes() - start) * 1024 / size**2
+    return peak_megabytes() - start
 
 
 def main() -> None:
@@ -90,16 +91,19 @@ def main() -> None:
     rows = [forward(n, 2) for n in ((32,) if args.smoke else (96, 256, 512))]
     trained = [training(n, 2) for n in ((24,) if args.smoke else (64,))]
     held = {n: float(fresh_process("benchmarks.speed.slope_dls", "--memory", str(n)).split()[-1])
-            for n in ((32,) if args.smoke else (256, 512))}  # fmt: skip
+            for n in ((32, 48) if args.smoke else (512, 1024))}  # fmt: skip
+    small, large = held
+    further = (held[large] - held[small]) * 1024 / (large**2 - small**2)
     folder = results_folder(args.smoke)
-    write_json(folder / "slope_dls_speed.json", forward=rows, training=trained, kilobytes_a_pixel=held)
-    header = ("size", "DLS(15), s", "PyTorch alone", "SlopeDLS", "fast", "disk", "SlopeDLS / DLS", "PyTorch alone",
-              "disk / whole")  # fmt: skip
+    write_json(folder / "slope_dls_speed.json", forward=rows, training=trained, megabytes=held)
+    header = ("size", "DLS(15), s", "PyTorch alone", "SlopeDLS", "PyTorch alone", "fast", "disk", "SlopeDLS / DLS",
+              "PyTorch alone", "disk / whole")  # fmt: skip
     lines = []
     for r in rows:
-        dls, alone, slope = r["DLS(15)"], r["DLS(15), PyTorch alone"], r["SlopeDLS"]
-        ratios = slope / dls, slope / alone, r["disk"] / slope
-        lines.append((f"{r['size']}^2", *(f"{x:.2f}" for x in (dls, alone, slope, r["fast"], r["disk"], *ratios))))
+        (dls, alone), (slope, by_pytorch) = ((r[n], r[f"{n}, PyTorch alone"]) for n in ("DLS(15)", "SlopeDLS"))
+        ratios = slope / dls, by_pytorch / alone, r["disk"] / slope
+        times = dls, alone, slope, by_pytorch, r["fast"], r["disk"]
+        lines.append((f"{r['size']}^2", *(f"{x:.2f}" for x in (*times, *ratios))))
     text = (
         f"Seconds of one core; the disk is {SHARE:.0%} of the image:\n\n{markdown_table(header, lines)}\n"
         f"{made_by('benchmarks.speed.slope_dls')}\n"
@@ -109,8 +113,8 @@ def main() -> None:
             for t in trained
         )
         + "Memory: "
-        + ", ".join(f"{kb:.2f} KB a pixel at {n}^2" for n, kb in held.items())
-        + ".\n"
+        + ", ".join(f"{mb:.0f} MB at {n}^2" for n, mb in held.items())
+        + f", tables of the noise included: {further:.2f} KB for each further pixel.\n"
     )
     (folder / "slope_dls_speed.md").write_text(text)
     print(text)

@@ -55,6 +55,7 @@ def sweep(size: int, order: Order, seconds: float) -> dict[str, Any]:
     D, B, mu = result.dictionary, result.codes, result.mu[:, None]
     apart = F.unfold(result.height, 8, stride=2)
     together = apart.mT.contiguous().mT
+    B = B.contiguous()  # as sweeps by PyTorch alone leave them
     R, codes, product = (together.mT - B.mT @ D.mT).mT, B.clone(), torch.empty_like(B)
     candidates: dict[str, Callable[[], Any]] = {
         "unfold": lambda: _alone(soup_dil_sweep, apart, D, B, mu, order=order),

@@ -1,4 +1,4 @@
-"""Cosine transforms against SciPy, across the switch from matrix to FFT, and the Laplacian they diagonalise."""
+"""Cosine transforms against SciPy and sums of cosines, from matrices to FFT, and the Laplacian they diagonalise."""
 
 import numpy as np
 import pytest
@@ -7,18 +7,37 @@ import torch
 
 from tests.helpers import assert_adjoint, assert_gradients, random_field
 from torchdls import GradientOperator, dct2, idct2
-from torchdls.operators import neumann_eigenvalues
+from torchdls.operators import cosine, neumann_eigenvalues
 
 SHAPES = [(1, 1), (1, 5), (6, 1), (2, 3), (8, 8), (64, 64), (64, 65), (65, 64), (66, 3), (3, 67), (128, 97), (129, 130)]
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_dct_is_scipys_orthonormal_one(shape):
+def test_dct_is_scipys_orthonormal_one(shape, monkeypatch):
+    """By PyTorch, as where something is recorded."""
+    monkeypatch.setattr(cosine, "plain", lambda _: False)
     x = random_field(2, 3, *shape)
     expected = scipy.fft.dctn(x.numpy(), type=2, norm="ortho", axes=(-2, -1))
     np.testing.assert_allclose(dct2(x).numpy(), expected, atol=1e-11)
     np.testing.assert_allclose(idct2(x).numpy(), scipy.fft.idctn(x.numpy(), norm="ortho", axes=(-2, -1)), atol=1e-11)
     torch.testing.assert_close(idct2(dct2(x)), x, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("shape", [(65, 64), (3, 67), (129, 70)], ids=str)
+def test_where_scipy_does_it_sums_of_cosines_come_out(shape, threads):
+    x, gain = random_field(2, 3, *shape), random_field(*shape, seed=1)
+    rows, columns = (cosine.cosine_matrix(n, like=x) for n in shape)
+    assert cosine.plain(x)
+    assert not cosine.plain(x.clone().requires_grad_())
+    torch.set_num_threads(threads)
+    try:
+        there, back, both = dct2(x), idct2(x), cosine.filtered(x, gain)
+    finally:
+        torch.set_num_threads(1)
+    torch.testing.assert_close(there, rows @ x @ columns.mT, rtol=0, atol=1e-11)
+    torch.testing.assert_close(back, rows.mT @ x @ columns, rtol=0, atol=1e-11)
+    torch.testing.assert_close(both, rows.mT @ (gain * (rows @ x @ columns.mT)) @ columns, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("shape", [(5, 4), (70, 3), (67, 66)], ids=str)

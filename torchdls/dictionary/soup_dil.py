@@ -128,7 +128,7 @@ def _swept(
     rule = rule._replace(levels=_levels(mu, B, in_place), in_place=in_place)
     alone = in_place and _is_alone(R, D, learn)
     if patches:
-        B = B.clone() if in_place else B
+        B = B.clone(memory_format=torch.contiguous_format) if in_place else B  # each row contiguous, as rows are read
         if by_atom or not alone:
             # Each patch contiguous in memory, whatever the layout of P (`unfold` puts its pixels far apart).
             R = torch.baddbmm(R.mT, B.mT, D.mT.expand(R.shape[0], -1, -1), alpha=-1).mT

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchdls._checks import check_real, require
 from torchdls._precision import full_precision
+from torchdls._tracing import is_recorded
 from torchdls.operators.tables import table
 
 # Up to this side two products with the cosine matrix beat the FFT and its reordering passes (measured on a CPU).
@@ -47,6 +49,8 @@ def dct2(x: Tensor) -> Tensor:
     h, w = x.shape[-2:]
     if max(h, w) <= MATRIX_LIMIT:
         return cosine_matrix(h, like=x) @ x @ cosine_matrix(w, like=x).mT
+    if plain(x):
+        return torch.from_numpy(_scipy().dctn(x.detach().numpy(), **_how()))
     spectrum = torch.fft.rfft2(_reordered(x))
     p = spectrum * _twiddle(h, w, like=x)
     q = _negate_rows(spectrum).conj() * _twiddle_conj(h, w, like=x)
@@ -77,6 +81,8 @@ def idct2(x: Tensor) -> Tensor:
     h, w = x.shape[-2:]
     if max(h, w) <= MATRIX_LIMIT:
         return cosine_matrix(h, like=x).mT @ x @ cosine_matrix(w, like=x)
+    if plain(x):
+        return torch.from_numpy(_scipy().idctn(x.detach().numpy(), **_how()))
     # The spectrum of the reordered image, from sums C without their scale, and C[H, .] = C[., W] = 0:
     # V[k, l] = conj(a_k b_l) ((C[k, l] - C[H-k, W-l]) - i (C[H-k, l] + C[k, W-l])).
     head = x[..., : w // 2 + 1]
@@ -84,6 +90,29 @@ def idct2(x: Tensor) -> Tensor:
     spectrum = torch.complex(head - _reverse_rows(tail), -(_reverse_rows(head) + tail))
     y = torch.fft.irfft2(spectrum * _inverse_twiddle(h, w, like=x), s=(h, w))
     return _restored(y)
+
+
+def plain(x: Tensor) -> bool:
+    """Whether SciPy may do the transforms, in a third of the time: on the CPU, where nothing is recorded."""
+    return x.device.type == "cpu" and not is_recorded(x)
+
+
+def filtered(x: Tensor, gain: Tensor) -> Tensor:
+    """idct2(gain * dct2(x)) of a `plain` x, in the memory of the result alone."""
+    coefficients = _scipy().dctn(x.detach().numpy(), **_how())
+    torch.from_numpy(coefficients).mul_(gain)
+    return torch.from_numpy(_scipy().idctn(coefficients, overwrite_x=True, **_how()))
+
+
+def _scipy() -> Any:
+    """Loaded when first used."""
+    import scipy.fft
+
+    return scipy.fft
+
+
+def _how() -> dict[str, Any]:
+    return {"axes": (-2, -1), "norm": "ortho", "workers": torch.get_num_threads()}
 
 
 def _check(name: str, x: Tensor) -> None:

@@ -10,7 +10,15 @@ from torch import Tensor
 from torchdls._precision import full_precision
 from torchdls._tracing import is_concrete, is_recorded
 from torchdls.operators import dct2, idct2, neumann_eigenvalues, slope_divergence
-from torchdls.operators.cosine import MATRIX_LIMIT, cosine_matrix, from_half_spectrum, half_spectrum, mirrored
+from torchdls.operators.cosine import (
+    MATRIX_LIMIT,
+    cosine_matrix,
+    filtered,
+    from_half_spectrum,
+    half_spectrum,
+    mirrored,
+    plain,
+)  # fmt: skip
 from torchdls.operators.tables import table
 from torchdls.solvers.cg import LinearMap
 
@@ -117,12 +125,16 @@ def direct_map(
     overwrite: bool = False,
 ) -> LinearMap:
     """The map b -> (A^T A + r)^{-1} b for repeated use: its gains are computed once. It may overwrite b on request."""
-    if max(size) <= MATRIX_LIMIT:
+    small, by_scipy = max(size) <= MATRIX_LIMIT, plain(like) and (r is None or plain(r))
+    if small or by_scipy:
         if r is None:
             gain = _gain(*size, *pixel_size, like=like)
         else:
             gain = _inverse(neumann_eigenvalues(size, like, pixel_size) + r)
-        return lambda b: idct2(dct2(b) * gain)
+        if small:
+            return lambda b: idct2(dct2(b) * gain)
+        shared = gain.ndim == 2 or len(gain) == 1
+        return lambda b: _few_at_a_time(lambda x: filtered(x, gain), b) if shared else filtered(b, gain)
     own, other = _tables(size, r, pixel_size, like)
 
     def solve_part(b: Tensor) -> Tensor:
