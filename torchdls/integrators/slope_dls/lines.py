@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torchdls._tracing import is_recorded
 from torchdls.operators.cosine import cosine_matrix
 from torchdls.operators.tables import table
 
@@ -200,7 +201,8 @@ def _from_left(a: Tensor, x: Tensor) -> Tensor:
 
 
 def _sum(pieces: list[Tensor]) -> Tensor:
-    total = pieces[0]
+    """Of fresh tensors, in the memory of the first where nothing is recorded."""
+    total, in_place = pieces[0], not is_recorded(*pieces)
     for piece in pieces[1:]:
-        total = total + piece
+        total = total.add_(piece) if in_place else total + piece
     return total

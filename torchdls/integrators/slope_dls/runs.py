@@ -202,8 +202,12 @@ class Run:
                 weights.append(weight)
                 weight = weight[..., None]
                 coefficients = coefficients.mul_(weight) if in_place else coefficients * weight
-            totals.append(places.back_across(coefficients))
-        total = places.back_down(torch.cat(totals, -2))
+            estimates = places.back_across(coefficients)
+            if in_place:
+                strips[..., rows, :] = estimates  # nobody asks for what was there any more
+            else:
+                totals.append(estimates)
+        total = places.back_down(torch.cat(totals, -2) if totals else strips)
         weight = places.spread(torch.cat(weights, 2)) if weights else places.coverage(slopes)
         return added(Coded(total, weight), so_far)
 
