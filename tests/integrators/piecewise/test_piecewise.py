@@ -25,7 +25,16 @@ from torchdls.integrators.piecewise.integrator import _HELD, _Search
 from torchdls.integrators.piecewise.measured import GRAZING, believed, ends, filled, follows_tilt, measure
 from torchdls.integrators.piecewise.pieces import pieces_of, tied_pieces
 from torchdls.integrators.piecewise.prior import NAMES, continued, features, fitted, log_odds
-from torchdls.integrators.piecewise.search import Costs, Problem, _safe, energy, out_of_order, robust_weights, search
+from torchdls.integrators.piecewise.search import (
+    Costs,
+    Problem,
+    _loose,
+    _safe,
+    energy,
+    out_of_order,
+    robust_weights,
+    search,
+)
 
 
 def hinged(n: int = 32) -> tuple[Tensor, Tensor]:
@@ -172,13 +181,19 @@ def test_jumps_are_out_of_order_where_the_side_that_dives_is_farther():
     assert float(out_of_order(problem, -behind)) > 0.9
 
 
-def test_where_jumps_are_out_of_order_the_height_is_that_from_bilateral_for_this_surface_alone():
+def test_where_jumps_are_not_believed_the_height_is_that_from_bilateral_for_this_surface_alone():
     """A plate that floats has no side at which it meets the plane, whichever way it lies; a hinged ramp has one."""
     both = torch.cat([floating_plate(32)[0], hinged(32)[0]])
     found, alone = search(problem_of(-both)), search(problem_of(-both[:1]))
     assert found.doubtful.tolist() == [True, False]
     torch.testing.assert_close(found.y[:1], _safe(problem_of(-both[:1])), rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(found.cut[:1], alone.cut, rtol=1e-6, atol=1e-6)
+
+
+def test_share_of_the_pixels_in_pieces_without_a_tie():
+    pieces = torch.tensor([[[[1, 1, 2, 0]]], [[[1, 2, 2, 3]]]])
+    tied = torch.tensor([[True, False, True], [False, False, True]])
+    torch.testing.assert_close(_loose(pieces, tied), torch.tensor([1 / 3, 3 / 4]))
 
 
 def test_energy_is_lowered_by_its_reweighted_solves():

@@ -16,8 +16,7 @@ from torchdls.integrators.base import Fields
 from torchdls.integrators.data_term import Quadratic
 from torchdls.integrators.iterative import Callback, Iterative
 from torchdls.integrators.piecewise.measured import GRAZING, believed, filled, follows_tilt, measure
-from torchdls.integrators.piecewise.pieces import pieces_of, tied_pieces
-from torchdls.integrators.piecewise.search import Found, Problem, odds, search
+from torchdls.integrators.piecewise.search import Problem, search
 from torchdls.integrators.slope_dls import SlopeDLS
 from torchdls.operators import edge_slopes, present_edges
 from torchdls.solvers import solve
@@ -25,8 +24,6 @@ from torchdls.solvers.poisson import fold_vmap
 
 _NOISY = math.radians(0.9)  # noise of the normals, per tangential component, from which they are coded
 _LEFT = 0.4  # share of the noise that the coder leaves
-_FEW = 4  # edges cut below which a surface does not jump
-_LIKELY = 0.1  # probability from which an edge may be cut
 _HELD = 1e-8  # weight of the jumps found, as part of the largest of the edges
 
 
@@ -87,9 +84,8 @@ class Piecewise(Iterative[PiecewiseResult]):
        reweighted solves from least squares with all open that may be cut, with s falling from 4 s to s and costs that
        fall where contours go on; under noise by more of them. What is found tells where the surface jumps, and into
        which pieces it falls.
-    4. Where a fifth of its jumps or more are clearly in the less likely order, the normals do not tell the order of the
-       sides, and the place of a piece that nothing ties is not believed: the height is then that of six reweighted
-       solves from `Bilateral`.
+    4. It is not believed where a fifth of its jumps are clearly in the less likely order, or a tenth of the pixels in
+       pieces that nothing ties, which lie anywhere: the height is then that of six reweighted solves from `Bilateral`.
 
     Where no jump is found, the height is that of `SlopeDLS`, on a field that does not jump; but that of the last solve
     where the noise is found to be one of normals, which makes steep slopes much worse than flat ones. A piece whose
@@ -243,7 +239,7 @@ class _Search(torch.autograd.Function):
     """Weights, slopes and cuts (N, 2, H, W) of the depth found; nothing of it has a derivative.
 
     Returns:
-        weights and slopes; (N,) whether the order is doubtful; probability of a cut; (N,) whether none was found;
+        weights and slopes; (N,) whether jumps are doubtful; probability of a cut; (N,) whether none was found;
         pieces (N, 1, H, W); tied (N, K).
     """
 
@@ -265,19 +261,8 @@ class _Search(torch.autograd.Function):
         pull = None if anchor_weight is None else anchor_weight / scale**2
         fields = Fields(raw, mask, weight, anchor, pull, steps)
         problem = Problem.of(measure(p, fields, _LEFT * noise), noise, fields)
-        live = problem.m.live
-        inside = torch.ones_like(p[:, :1], dtype=torch.bool) if mask is None else mask.expand_as(p[:, :1])
-        if bool(live.any()):
-            found = search(problem)
-        else:
-            found = Found(torch.zeros_like(p[:, :1]), torch.zeros_like(p), torch.zeros_like(p), noise > 1)
-        y, w, jump, doubtful = found
-        cut = jump > 0.5
-        smooth = cut.flatten(1).sum(1) < _FEW
-        held = torch.zeros_like(inside) if anchor_weight is None else (anchor_weight > 0).expand_as(inside) & inside
-        likely = odds(problem).sigmoid().sum(1) > _LIKELY
-        pieces = pieces_of(cut & ~smooth[:, None, None, None], likely, live, inside)
-        return w, problem.slopes(y), doubtful, jump, smooth, pieces, tied_pieces(pieces, live, held)
+        y, w, doubtful, *found = search(problem)
+        return w, problem.slopes(y), doubtful, *found
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:

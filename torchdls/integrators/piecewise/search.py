@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchdls.integrators.fields import Fields
 from torchdls.integrators.piecewise.measured import Measured
+from torchdls.integrators.piecewise.pieces import pieces_of, tied_pieces
 from torchdls.integrators.piecewise.prior import continued, features, log_odds
 from torchdls.integrators.robust import Bilateral
 from torchdls.integrators.settling import select
@@ -23,6 +24,10 @@ _HOLD = 1e-9  # weight of the present height, as part of the largest of the edge
 _DAMPING = 0.3  # share of the coupled odds
 _JUMP = 2.0  # pixels from which a jump has an order
 _CLEARLY = 2.0  # log odds from which one order is likelier
+_CUT = 0.5  # probability from which an edge counts as cut
+_FEW = 4  # edges cut below which a surface does not jump
+_LIKELY = 0.1  # probability from which an edge may be cut
+_LOOSE = 0.1  # share of the pixels without a tie above which a surface is not believed
 _DISORDER = 0.2  # share of jumps in the wrong order from which a surface is not believed
 
 
@@ -188,30 +193,60 @@ class Found(NamedTuple):
     Attributes:
         y: (N, 1, H, W) depth.
         weight: (N, 2, H, W) of the edges, but for the trusts.
+        doubtful: (N,) bool, whether the jumps are not believed, so that y is that from `Bilateral`.
         cut: (N, 2, H, W) probability of a cut.
-        doubtful: (N,) bool, whether the order of the sides is not told.
+        smooth: (N,) bool, whether nothing is cut.
+        pieces: (N, 1, H, W) int64, as `pieces_of` gives them.
+        tied: (N, K) bool, as `tied_pieces` gives it.
     """
 
     y: Tensor
     weight: Tensor
-    cut: Tensor
     doubtful: Tensor
+    cut: Tensor
+    smooth: Tensor
+    pieces: Tensor
+    tied: Tensor
 
 
 def search(problem: Problem) -> Found:
     """The start with all open, the steps from it, and those from `Bilateral` where the first cannot be believed.
 
-    Where all that may be cut starts open, jumps are found best, but what hangs together by nothing lies anywhere.
-    Where rims or ties tell the order of the sides, few jumps contradict it. Where many do, the one-sided trusts are the
-    safer guess, which is looked for only then. The energy does not tell: it is lower for the first in any case. Under
-    noise more steps are of use. Where the surface jumps, the first start tells always.
+    Where all that may be cut starts open, jumps are found best, but what hangs together by nothing lies anywhere. So it
+    is not believed where more than a tenth of the pixels are in pieces without a tie, or many jumps contradict the
+    order of the sides that the normals tell: there the one-sided trusts are the safer guess. The energy does not tell,
+    being lower for the first in any case. Under noise more steps are of use. Where the surface jumps, the first start
+    tells always.
     """
-    bold = coupled(problem, opened(problem))
-    bold = _where(problem.noise > 0, problem, bold, lambda part, y: coupled(part, y, (1, 1, 1)))
-    doubtful = out_of_order(problem, bold) >= _DISORDER
+    if bool(problem.m.live.any()):
+        bold = coupled(problem, opened(problem))
+        bold = _where(problem.noise > 0, problem, bold, lambda part, y: coupled(part, y, (1, 1, 1)))
+    else:
+        bold = torch.zeros_like(problem.m.v[:, :1])
+    cut = posterior(problem, bold)
+    smooth = (cut > _CUT).flatten(1).sum(1) < _FEW
+    pieces, tied = _fallen_apart(problem, (cut > _CUT) & ~smooth[:, None, None, None])
+    doubtful = (out_of_order(problem, bold) >= _DISORDER) | (_loose(pieces, tied) > _LOOSE)
     y = _where(doubtful, problem, bold, lambda part, _: _safe(part))
-    cost = costs(problem, odds(problem, y))
-    return Found(y, robust_weights(problem, y, cost), posterior(problem, bold), doubtful)
+    weight = robust_weights(problem, y, costs(problem, odds(problem, y)))
+    return Found(y, weight, doubtful, cut, smooth, pieces, tied)
+
+
+def _fallen_apart(problem: Problem, cut: Tensor) -> tuple[Tensor, Tensor]:
+    """The pieces into which cuts (N, 2, H, W) part the surface, and which of them are tied."""
+    mask, live, pull = problem.fields.mask, problem.m.live, problem.fields.anchor_weight
+    size = cut[:, :1]
+    inside = torch.ones_like(size) if mask is None else mask.expand_as(size)
+    anchored = torch.zeros_like(size) if pull is None else (pull > 0).expand_as(size) & inside
+    pieces = pieces_of(cut, odds(problem).sigmoid().sum(1) > _LIKELY, live, inside)
+    return pieces, tied_pieces(pieces, live, anchored)
+
+
+def _loose(pieces: Tensor, tied: Tensor) -> Tensor:
+    """(N,) share of the pixels that are in pieces without a tie."""
+    flat = pieces.flatten(1)
+    held = torch.cat([torch.ones_like(tied[:, :1]), tied], 1).gather(1, flat)
+    return (~held).sum(1) / (flat > 0).sum(1).clamp(min=1)
 
 
 def _safe(problem: Problem) -> Tensor:
