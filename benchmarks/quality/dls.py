@@ -1,9 +1,10 @@
 """Quality of DLS on the surfaces of the paper: `python -m benchmarks.quality.dls` (add --smoke for a smoke run).
 
 Tent and Vase at 200 x 200 under white noise, several draws each: least squares, DLS with its default parameters, and
-DLS with the best fixed threshold of a sweep, beside the columns of the paper. `--trials` measures single changes to
-the algorithm. All noise draws of a surface run as one batch. Writes JSON and a Markdown table; docs/results.md quotes
-the table.
+DLS with the best fixed threshold of a sweep, beside the columns of the paper. `--quick` leaves the sweep out and adds
+DLS with its slow waves shrunk and SlopeDLS, up to 20 dB (slow_waves.md). `--trials` measures single changes to the
+algorithm. All noise draws of a surface run as one batch. Writes JSON and a Markdown table; docs/results.md quotes the
+table.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.common.report import markdown_table, results_folder, write_json
-from torchdls import DLS, SURFACES, LeastSquares, Proximal, SoupDIL, add_noise
+from benchmarks.common.report import made_by, markdown_table, results_folder, write_json
+from torchdls import DLS, SURFACES, LeastSquares, Proximal, SlopeDLS, SoupDIL, add_noise, noise_level, shrink_slow_waves
 from torchdls.metrics import mean_angular_error, rmse, ssim
 from torchdls.noise import noise_sigma
 
@@ -112,6 +113,27 @@ def run_table(case: Case, n_iter: int, sweep: Sequence[float]) -> list[dict[str,
     return rows
 
 
+def run_quick(case: Case) -> list[dict[str, Any]]:
+    """DLS as it comes, its slow waves shrunk, and SlopeDLS, with the SSIM of the paper."""
+    g, plain, height = case.gradient, LeastSquares()(case.gradient), DLS()(case.gradient)
+    found = {
+        "least squares": plain,
+        "DLS": height,
+        "DLS, slow waves": shrink_slow_waves(height, plain, noise_level(g)),
+        "SlopeDLS": SlopeDLS()(g),
+    }
+    measured = {name: case.measures(z) for name, z in found.items()}
+    rows = []
+    for i, snr in enumerate(case.snrs):
+        row: dict[str, Any] = {"surface": case.name, "SNR (dB)": snr}
+        row |= {name: float(m["ssim"][i].mean()) for name, m in measured.items()}
+        row["paper: DLS"] = PAPER[case.name]["dls"][SNRS.index(snr)]
+        row |= {f"RMSE: {name}": float(m["rmse"][i].mean()) for name, m in measured.items()}
+        rows.append(row)
+        print(*row.values(), flush=True)
+    return rows
+
+
 def run_trials(case: Case, n_iter: int, factors: Sequence[float]) -> list[dict[str, Any]]:
     """Each change alone, at the best of a few thresholds where several are given."""
     start = case.measures(LeastSquares()(case.gradient))
@@ -146,6 +168,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="small surfaces, one draw, few iterations: does it run?")
+    parser.add_argument("--quick", action="store_true", help="no sweep; slow waves shrunk, and SlopeDLS, up to 20 dB")
     parser.add_argument("--trials", action="store_true", help="single changes to the algorithm on Tent at 1, 10, 20 dB")
     parser.add_argument("--seeds", type=int, default=3, help="noise draws per row")
     parser.add_argument("--first-seed", type=int, default=0)
@@ -158,6 +181,16 @@ def main() -> None:
     if args.trials:
         trials = run_trials(Case("tent", (1, 10, 20), seeds, n), n_iter, (1.5,) if not args.smoke else sweep)
         path = write_json(out / "trials.json", trials=trials)
+    elif args.quick:
+        with torch.no_grad():
+            quick = [
+                row for name in PAPER for row in run_quick(Case(name, SNRS[:1] if args.smoke else SNRS[:4], seeds, n))
+            ]
+        lines = [[*map(str, [*r.values()][:2]), *(f"{x:.3f}" for x in [*r.values()][2:])] for r in quick]
+        path = write_json(out / "slow_waves.json", settings={"size": n, "seeds": [*seeds]}, rows=quick)
+        note = "\nSSIM, then RMSE in pixels; means of the draws.\n\n"
+        command = f"benchmarks.quality.dls --quick --seeds {args.seeds}"
+        (out / "slow_waves.md").write_text(markdown_table([*quick[0]], lines) + note + made_by(command))
     else:
         rows = [row for name in PAPER for row in run_table(Case(name, SNRS, seeds, n), n_iter, sweep)]
         path = write_json(out / "quality.json", rows=rows)
