@@ -245,7 +245,7 @@ def averaging_error_by_loops(g, t, sigma):
                 if (trust[i : i + 4] > 0).all():
                     r = slopes[i] - 3 * slopes[i + 1] + 3 * slopes[i + 2] - slopes[i + 3]
                     u = 1 / trust[i] + 9 / trust[i + 1] + 9 / trust[i + 2] + 1 / trust[i + 3]
-                    total, noise, weight = total + r * r / (u + 600), noise + u / (u + 600), weight + 1 / (u + 600)
+                    total, noise, weight = total + r * r / (u + 6e3), noise + u / (u + 6e3), weight + 1 / (u + 6e3)
     return (total / sigma**2 - noise) / weight / 48
 
 

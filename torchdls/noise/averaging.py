@@ -9,7 +9,7 @@ from torchdls.noise.level import normalised, robust_scale, trusts
 from torchdls.operators import edge_slopes
 from torchdls.operators.edges import cell_curl, mean_trust
 
-_ORDINARY = 600.0  # 30 times u for trusts of 1
+_ORDINARY = 6000.0  # 300 times u for trusts of 1
 _LARGEST_ERROR = 1e4  # of averaging, in units of the noise: beyond it all weights are alike anyway
 
 
@@ -28,7 +28,7 @@ def averaging_error(
         r = g_{i-1} - 3 g_i + 3 g_{i+1} - g_{i+2},     mean error^2 = mean (r^2 - sigma^2 u) / 48
         u = 1/t_{i-1} + 9/t_i + 9/t_{i+1} + 1/t_{i+2}
 
-    The mean over the surface is weighted by 1 / (u + 600) for trusts of mean 1: all edges alike, also those where steep
+    The mean over the surface is weighted by 1 / (u + 6000) for trusts of mean 1: all edges alike, those where steep
     relief is trusted less, but for the worst, whose noise would drown the rest. sigma is read from the curl, as by
     `noise_level`.
 
