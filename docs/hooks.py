@@ -111,7 +111,7 @@ def table(name: str) -> str:
         value = registry.find(key)
         link = f"[`{value.__name__}`][{value.__module__}.{value.__name__}]"
         rows.append(f"| `{key}` | {link} | {in_a_cell(registry.summary(key))} |")
-    return "\n".join([f"### {name}\n", "| name | | |", "|---|---|---|", *rows, ""])
+    return "\n".join([f"### {name}\n", "| name | in Python | what it is |", "|---|---|---|", *rows, ""])
 
 
 def in_a_cell(text: str) -> str:
