@@ -74,34 +74,40 @@ def sweep(
         R (with `patches`, whatever it was used for), D and B.
     """
     R, D, B = R.detach(), D.detach(), B.detach()
-    by_atom, rowwise = atom_order and learn, torch.contiguous_format
-    codes = B if by_atom else B.mT
-    codes = codes.clone(memory_format=rowwise) if patches else codes.contiguous()
+    by_atom = atom_order and learn
     if not patches:
-        rows = R.mT.contiguous()
+        codes, rows, before = (B if by_atom else B.mT).contiguous(), R.mT.contiguous(), B
+    elif by_atom:
+        codes = B.clone(memory_format=torch.contiguous_format)
+        rows, before = torch.baddbmm(R.mT, B.mT, D.mT.expand(len(R), -1, -1), alpha=-1), B
     else:
-        rows = torch.baddbmm(R.mT, B.mT, D.mT.expand(len(R), -1, -1), alpha=-1) if by_atom else R.mT
+        codes, rows, before = torch.empty_like(B.mT, memory_format=torch.contiguous_format), R.mT, B.mT
     cut = cut.to(B).expand(len(B), -1).contiguous()
     how = _How(B.new_full((), bound).numpy()[()], THRESHOLDS.index(threshold), keep, learn, patches)
     step, new = _atom_order if by_atom else _block_order, []
     alone = len(D) == 1 and learn and len(R) > 1
     for i in (slice(None),) if alone else (slice(k, k + 1) for k in range(len(R))):
-        new.append(step(rows[i], D[0 if len(D) == 1 else i.start], codes[i], cut[i], how))
+        new.append(step(rows[i], D[0 if len(D) == 1 else i.start], codes[i], before[i], cut[i], how))
     return rows.mT, torch.stack(new) if learn else D, codes if by_atom else codes.mT
 
 
-def _block_order(R: Tensor, D: Tensor, codes: Tensor, cut: Tensor, how: _How) -> Tensor:
-    """All codes, then all atoms, of surfaces (m, L, n) and (m, L, K) with one dictionary (n, K), which comes back."""
+def _block_order(R: Tensor, D: Tensor, codes: Tensor, before: Tensor, cut: Tensor, how: _How) -> Tensor:
+    """All codes, then all atoms, of surfaces (m, L, n) and (m, L, K) with one dictionary (n, K), which comes back.
+
+    With patches in place of the residual, `before` holds the codes to start from, and `codes` has room for them.
+    """
     loops, (n, K), length = _loops(), D.shape, _CHUNK * torch.get_num_threads()
     atoms = D.mT.contiguous()
     moves = torch.cat([(atoms @ D).triu(1), atoms], 1).numpy()
     H, C = (R.new_zeros(K, k, dtype=torch.float64) for k in (n, K))
     Q, room = codes.new_empty(min(length, R.shape[1]), K), R.new_empty(min(length, R.shape[1]) if how.patches else 0, n)
-    used, counts = (codes.new_empty(shape, dtype=torch.int16) for shape in (codes.shape, codes.shape[:2]))
+    kept = codes[:, :length] if how.patches else codes  # lists of codes that `follow` reads, or nobody
+    values, used = torch.empty_like(kept), torch.empty_like(kept, dtype=torch.int16)
+    counts = used.new_empty(kept.shape[:2])
 
-    def update(level: Any, r: Tensor, q: Tensor, b: Tensor, u: Tensor, many: Tensor) -> tuple[Tensor, Tensor]:
-        h, c = R.new_zeros(K, n), R.new_zeros(K, K)
-        given = (x.numpy() for x in (r, q, b, u.view(-1), many))
+    def update(level: Any, r: Tensor, q: Tensor, b: Tensor, *lists: Tensor) -> tuple[Tensor, Tensor]:
+        h, c, (u, v, many) = R.new_zeros(K, n), R.new_zeros(K, K), lists
+        given = (x.numpy() for x in (r, q, b, u.view(-1), v.view(-1), many))
         loops.update_codes(*given, moves, level, how.bound, how.rule, h.numpy(), c.numpy())
         return h, c
 
@@ -109,11 +115,12 @@ def _block_order(R: Tensor, D: Tensor, codes: Tensor, cut: Tensor, how: _How) ->
         for i, part in _chunks(R, length):
             r, b = R[i, part], codes[i, part]
             if how.patches:
-                r = room[: len(r)].copy_(r)
-                workers.split(lambda x, c: loops.subtract(x.numpy(), c.numpy(), atoms.numpy()), r, b)
+                r, P = room[: len(r)], r
+                workers.split(functools.partial(_subtract, atoms), P, before[i, part], r, b)
             q = torch.mm(r, D, out=Q[: len(r)])
             level = cut[i].numpy()
-            for h, c in workers.split(functools.partial(update, level), r, q, b, used[i, part], counts[i, part]):
+            lists = (x[i, slice(len(r)) if how.patches else part] for x in (used, values, counts))
+            for h, c in workers.split(functools.partial(update, level), r, q, b, *lists):
                 H += h
                 C += c
         if not how.learn:
@@ -122,15 +129,15 @@ def _block_order(R: Tensor, D: Tensor, codes: Tensor, cut: Tensor, how: _How) ->
         loops.update_atoms(H.numpy(), C.numpy(), atoms.numpy(), how.keep, new.numpy())
         step = (new - atoms).numpy()
 
-        def follow(r: Tensor, b: Tensor, u: Tensor, many: Tensor) -> None:
-            loops.subtract_used(r.numpy(), b.numpy(), u.view(-1).numpy(), many.numpy(), step)
+        def follow(r: Tensor, u: Tensor, v: Tensor, many: Tensor) -> None:
+            loops.subtract_used(r.numpy(), u.view(-1).numpy(), v.view(-1).numpy(), many.numpy(), step)
 
         for i, part in () if how.patches else _chunks(R, length):
-            workers.split(follow, *(x[i, part] for x in (R, codes, used, counts)))
+            workers.split(follow, *(x[i, part] for x in (R, used, values, counts)))
     return new.mT
 
 
-def _atom_order(R: Tensor, D: Tensor, codes: Tensor, cut: Tensor, how: _How) -> Tensor:
+def _atom_order(R: Tensor, D: Tensor, codes: Tensor, _: Tensor, cut: Tensor, how: _How) -> Tensor:
     """Row, atom, row, atom, .. for surfaces (m, L, n) and (m, K, L) with one dictionary (n, K), which comes back."""
     loops, rows, atoms = _loops(), R.flatten(0, 1), D.mT.contiguous()
     new, count = torch.empty_like(atoms), len(rows)
@@ -144,6 +151,15 @@ def _atom_order(R: Tensor, D: Tensor, codes: Tensor, cut: Tensor, how: _How) -> 
             new.numpy(), where.numpy(), before.numpy(), after.numpy(),
         )  # fmt: skip
     return new.mT
+
+
+def _subtract(atoms: Tensor, *given: Tensor) -> None:
+    """R = P - B D^T from rows of P and B in any layout, and `codes` = B."""
+    P, B, R, codes = (x.numpy() for x in given)
+    loops = _loops()
+    loops.bring(P, R)
+    loops.bring(B, codes)
+    loops.subtract(R, codes, atoms.numpy())
 
 
 def _chunks(R: Tensor, length: int) -> Iterator[tuple[int, slice]]:

@@ -11,6 +11,7 @@ import numpy as np
 from torchdls._compiled import compiled
 
 _EXACT = 256  # terms that are summed in the dtype of the patches, before double precision takes over
+_STREAMS = 8  # columns that are read side by side
 
 
 @compiled
@@ -27,36 +28,55 @@ def _shrunk(x, cut, bound, rule):
 
 
 @compiled
-def subtract(R, codes, atoms):
-    """R -= D b for patches (L, n) and their codes (L, K)."""
-    for i in range(R.shape[0]):
-        for k in range(codes.shape[1]):
-            b = codes[i, k]
-            if b != 0:
-                for p in range(R.shape[1]):
-                    R[i, p] -= b * atoms[k, p]
+def bring(X, rows):
+    """Rows of X (L, m) into contiguous ones; in X, as `unfold` lays patches out, say, neighbours may lie far apart.
+
+    A few columns at a time, as many as the processor fetches ahead of.
+    """
+    L, m = X.shape
+    for start in range(0, m, _STREAMS):
+        end = min(start + _STREAMS, m)
+        for i in range(L):
+            for k in range(start, end):
+                rows[i, k] = X[i, k]
 
 
 @compiled
-def subtract_used(R, codes, used, counts, atoms):
-    """The same from the lists that `update_codes` leaves."""
+def subtract(R, codes, atoms):
+    """R -= D b for patches (L, n) and their codes (L, K)."""
+    own = np.empty(codes.shape[1] + 1, np.int64)
+    for i in range(R.shape[0]):
+        m = 0
+        for k in range(codes.shape[1]):  # without a branch
+            own[m] = k
+            m += codes[i, k] != 0
+        for t in range(m):
+            k = own[t]
+            b = codes[i, k]
+            for p in range(R.shape[1]):
+                R[i, p] -= b * atoms[k, p]
+
+
+@compiled
+def subtract_used(R, used, values, counts, atoms):
+    """R -= D b from the lists that `update_codes` leaves."""
     at = 0
     for i in range(R.shape[0]):
         for t in range(at, at + counts[i]):
-            k = np.int64(used[t])
-            b = codes[i, k]
+            k, b = np.int64(used[t]), values[t]
             for p in range(R.shape[1]):
                 R[i, p] -= b * atoms[k, p]
         at += counts[i]
 
 
 @compiled
-def update_codes(R, Q, codes, used, counts, moves, cut, bound, rule, H, C):
+def update_codes(R, Q, codes, used, values, counts, moves, cut, bound, rule, H, C):
     """All codes of some patches with the atoms held fixed.
 
     R (L, n) and `codes` (L, K) are brought up to date. Q (L, K) is D^T r. Row k of `moves` (K, K + n) says what a
     change of code k does to D^T r of the atoms after it, and to r. b r^T and b b^T are added to H (K, n) and C (K, K).
-    `used` and `counts` become the atoms that the patches use, one patch after the other, and how many they are.
+    `used`, `values` and `counts` become the atoms that the patches use, one patch after the other, their codes, and how
+    many they are.
     """
     (L, n), K, at = R.shape, Q.shape[1], 0
     state, own = np.empty(K + n, R.dtype), np.empty(K, np.int64)
@@ -86,7 +106,7 @@ def update_codes(R, Q, codes, used, counts, moves, cut, bound, rule, H, C):
                 H[k, p] += b * state[K + p]
             for c in range(m):
                 C[k, own[c]] += b * codes[i, own[c]]
-            used[at + t] = k
+            used[at + t], values[at + t] = k, b
         counts[i] = m
         at += m
 
