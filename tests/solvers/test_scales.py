@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.fuzz.values import field, firm, mask, rational_solve, trust
-from tests.helpers import MASKS, random_field, seeded, sparse_solve
+from tests.helpers import MASKS, random_field, seeded, sparse_solve, uniform_field
 from torchdls import INTEGRATORS, ConvergenceWarning, LeastSquares, edge_slopes, solve
 from torchdls.solvers import conjugate_gradients
 
@@ -185,6 +185,24 @@ def test_derivatives_in_weak_anchors(dtype):
     ((height - height[0, 0, 3, 4]) * probe).sum().backward()
     assert float(anchor.grad[0, 0, 3, 4]) == pytest.approx(float(probe.sum()), rel=1e-5)
     torch.testing.assert_close(v.grad, free.grad, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("dtype, limit", [(torch.float64, 2e-6), (torch.float32, 1e-5)], ids=str)
+@pytest.mark.parametrize("orders", [1, 2, 3, 4])
+def test_the_tolerance_holds_for_weights_that_vary(orders, dtype, limit):
+    """Where residuals alone, met to 1e-6, left errors of .2 contrast tol: 1.2e-3 at 10^3.9."""
+    for seed in range(4):
+        u = uniform_field(1, 2, 4, 4, seed=seed)
+        for exponent in (u[:, :, :1].expand(1, 2, 4, 4), (u < 0.5).double()):
+            v, w = random_field(1, 2, 4, 4, seed=seed).to(dtype), (10 ** (-orders * exponent)).to(dtype)
+            w[:, 0, :, -1] = w[:, 1, -1] = 0
+            r = torch.zeros(1, 1, 4, 4, dtype=dtype)
+            r[..., seed % 4, seed % 3] = 1.0
+            for given in ((None, None), (torch.zeros_like(r), r)):
+                exact = torch.from_numpy(sparse_solve(v[0], w[0], *(None if t is None else t[0] for t in given)))
+                found = solve(v, w, *given)
+                assert bool(found.converged.all())
+                assert error(found.height[0, 0], exact) < limit, (seed, given)
 
 
 @pytest.mark.parametrize("kind", ["mask", "weight", "anchor"])

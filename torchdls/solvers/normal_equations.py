@@ -46,8 +46,22 @@ def squares(like: Tensor, setting: Setting) -> Tensor:
 def steep(w: Tensor, setting: Setting) -> Tensor:
     """(N,) bool: the weights of a surface are further apart than `STEEP`."""
     w = w.detach() / squares(w, setting)
-    least = torch.where(w > 0, w, torch.inf).flatten(1).amin(1)
-    return w.flatten(1).amax(1) > STEEP * least
+    return w.flatten(1).amax(1) > STEEP * _least(w)
+
+
+def spread(w: Tensor, r: Tensor, setting: Setting) -> Tensor:
+    """(N,) by how much residuals understate errors: the largest weight of edges, by the least that holds any height.
+
+    H is at least the Laplacian times the smallest weight of its edges, and at least the smallest anchor weight.
+    """
+    w = w / squares(w, setting)
+    least = torch.maximum(_least(w), r.flatten(1).amin(1))
+    return (w.flatten(1).amax(1) / least).clamp(min=1)
+
+
+def _least(w: Tensor) -> Tensor:
+    """(N,) the smallest weight of an edge that is there; infinite where none is."""
+    return torch.where(w > 0, w, torch.inf).flatten(1).amin(1)
 
 
 def normal(w: Tensor, r: Tensor, setting: Setting) -> LinearMap:
