@@ -151,10 +151,10 @@ sys.exit(status)
 """
 
 
-def limited(*arguments):
+def limited(*arguments, code=LIMITED):
     """Status, standard error, and the peak memory in MB of a process of its own."""
     done = subprocess.run(
-        [sys.executable, "-c", LIMITED, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, "-c", code, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, check=False
     )
     return done.returncode, done.stderr, int(done.stdout.split()[-1]) / 1024
 
@@ -170,6 +170,23 @@ def test_a_header_is_not_believed(tmp_path, name):
     assert str(tmp_path / name) in error
     assert memory < 500
     assert not (tmp_path / "z.npy").exists()
+
+
+@LINUX
+@pytest.mark.slow
+def test_three_hundred_damaged_files_need_little_memory(tmp_path):
+    (tmp_path / "good").mkdir()
+    good, rng, paths = good_files(tmp_path / "good"), random.Random(11), []
+    for number in range(300):
+        whole = good[number % len(good)]
+        paths.append(tmp_path / f"bad{number}{whole.suffix}")
+        paths[-1].write_bytes(damage(whole.read_bytes(), rng, good))
+    code = LIMITED.replace("main(sys.argv[1:])", "max(main([*sys.argv[1:4], path, '-o', path + '.npy']) "
+                                                 "for path in sys.argv[4:])")  # fmt: skip
+    status, error, memory = limited("integrate", "--method", "least_squares", *paths, code=code)
+    assert status == 2
+    assert 150 < error.count("\n") <= 300
+    assert memory < 500
 
 
 @LINUX
