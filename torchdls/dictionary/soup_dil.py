@@ -15,7 +15,7 @@ from torchdls import _compiled
 from torchdls._checks import check_alike, check_real
 from torchdls._precision import full_precision
 from torchdls._tracing import is_recorded
-from torchdls.dictionary import sweep_chunks, sweep_fused
+from torchdls.dictionary import sweep_chunks, sweep_fused, sweep_rows
 from torchdls.dictionary.thresholds import THRESHOLDS, Threshold, cut, shrink
 
 Order = Literal["atom", "block"]
@@ -126,7 +126,7 @@ def _swept(
         options = {"keep": rule.unused == "keep", "atom_order": by_atom, "learn": learn, "patches": patches}
         return sweep_fused.sweep(R, D, B, rule.cuts(B), rule.bound, rule.threshold, **options)
     rule = rule._replace(levels=_levels(mu, B, in_place), in_place=in_place)
-    alone = in_place and _is_alone(R, D, learn)
+    alone = in_place and _is_alone(R, D, learn, by_atom)
     if patches:
         B = B.clone(memory_format=torch.contiguous_format) if in_place else B  # each row contiguous, as rows are read
         if by_atom or not alone:
@@ -137,27 +137,40 @@ def _swept(
     dictionaries = []
     for i in range(R.shape[0]):
         own, one = (R[i : i + 1], D[i : i + 1] if len(D) > 1 else D, B[i : i + 1]), rule.of_surface(i)
-        found = _atom_order(*own, one)[1] if by_atom else _block_order_alone(*own, one, learn, patches)
+        found = _atom_order_alone(*own, one) if by_atom else _block_order_alone(*own, one, learn, patches)
         dictionaries.append(found)
     return R, torch.cat(dictionaries) if learn else D, B
 
 
-def _is_alone(R: Tensor, D: Tensor, learn: bool) -> bool:
+def _is_alone(R: Tensor, D: Tensor, learn: bool, by_atom: bool) -> bool:
     """Whether surfaces are better swept one by one: each has thresholds that are numbers, and zeros to be skipped."""
-    together = R.shape[0] > 1 and (R.shape[-1] < _SHORTEST or (learn and D.shape[0] == 1))
-    return not together
+    several, short = R.shape[0] > 1, R.shape[-1] < _SHORTEST
+    return not (short and (several or by_atom)) and not (several and learn and D.shape[0] == 1)
 
 
 def _block_order_alone(R: Tensor, D: Tensor, B: Tensor, rule: _Rule, learn: bool, patches: bool) -> Tensor:
     """`_block_order` of one surface, in place; returns the dictionary."""
-    shrinkage = sweep_chunks.Shrinkage([float(m) for m in rule.levels], rule.bound, rule.threshold)
-    H, C = sweep_chunks.update_codes(R[0], D[0], B[0], shrinkage, patches)
+    H, C = sweep_chunks.update_codes(R[0], D[0], B[0], rule.of_numbers(), patches)
     if not learn:
         return D
     new = _update_atoms(H[None], C[None], D, rule)
     if not patches:
         R.mT.baddbmm_(B.mT, (D - new).mT)
     return new
+
+
+def _atom_order_alone(R: Tensor, D: Tensor, B: Tensor, rule: _Rule) -> Tensor:
+    """`_atom_order` of one surface, in place; returns the dictionary."""
+
+    def atom(h: Tensor, d: Tensor) -> Tensor:
+        return _where_used(rule.unit(h[None, :, None]), d[None, :, None], rule.unused)[0, :, 0]
+
+    patches, codes = R[0].mT.contiguous(), B[0].contiguous()
+    new = sweep_rows.update_rows(patches, D[0], codes, rule.of_numbers(), atom)
+    for given, found in ((R[0].mT, patches), (B[0], codes)):
+        if given.data_ptr() != found.data_ptr():
+            given.copy_(found)
+    return new[None]
 
 
 class _Rule(NamedTuple):
@@ -186,6 +199,10 @@ class _Rule(NamedTuple):
         """The rule for one surface of the batch, whose thresholds are numbers."""
         levels = [m if isinstance(m, float) else float(m[i if len(m) > 1 else 0]) for m in self.levels]
         return self._replace(levels=levels)
+
+    def of_numbers(self) -> sweep_chunks.Shrinkage:
+        """The same of one surface, whose thresholds are numbers."""
+        return sweep_chunks.Shrinkage([float(m) for m in self.levels], self.bound, self.threshold)
 
     def shrink(self, x: Tensor, atom: int) -> Tensor:
         return shrink(x, self.levels[atom], self.bound, self.threshold)
