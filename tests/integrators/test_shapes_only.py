@@ -81,6 +81,11 @@ def test_fake_tensors_pass_through(name, options):
     assert torch.equal(real, fixed(name, **options)(g, **optional))
 
 
+def test_atoms_of_sixteen_samples_are_made_without_values():
+    with FakeTensorMode():
+        assert SlopeDLS()(torch.empty(2, 2, 16, 18)).shape == (2, 1, 16, 18)
+
+
 def test_no_surface_comes_from_a_graph_that_cannot_be_made():
     """Conjugate gradients look at values: a graph of them is refused, rather than made of the shapes alone."""
     g, mask = bumps(2).float(), MASKS["disk"](16, 14).expand(2, -1, -1, -1)

@@ -159,17 +159,20 @@ def atoms(size: int, smooth: bool) -> Tensor:
         return cosines
     t = torch.linspace(-1, 1, size, dtype=torch.float64, device="cpu")
     functions = torch.cat([torch.stack([t**k for k in range(_DEGREE + 1)]), cosines[1:]])
-    parity = torch.tensor([*(k % 2 for k in range(_DEGREE + 1)), *(k % 2 for k in range(1, size))], device="cpu")
+    parity = [*(k % 2 for k in range(_DEGREE + 1)), *(k % 2 for k in range(1, size))]
+    kept: list[int] = []  # counted from the size: tensors may be without values
     found = torch.zeros_like(functions)
     for odd in (0, 1):
         half = (size + 1 - odd) // 2  # samples that are free; the middle one, if any, counts once
-        own, scale = (parity == odd).nonzero().flatten()[:half], t.new_full((half,), 2).sqrt()
+        own = [k for k, p in enumerate(parity) if p == odd][:half]
+        scale = t.new_full((half,), 2).sqrt()
         scale[size // 2 :] = 1
         q, r = torch.linalg.qr((functions[own, :half] * scale).mT)
         left = (q * r.diagonal().sign()).mT / scale
         found[own, :half] = left
         found[own, size - half :] = left.flip(1) * (1 - 2 * odd)
-    return found[found.any(1)]
+        kept += own
+    return found[sorted(kept)]
 
 
 def _inside(line: Line) -> Tensor:
