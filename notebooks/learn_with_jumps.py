@@ -78,12 +78,13 @@ for name, (parameters, losses) in found.items():
 print(f"true: tilt {tilt.numpy().round(3)}, factor {float(factor):.2f}")
 
 # %%
-figure, axes = plt.subplots(1, 4, figsize=(13, 3.2))
+figure, axes = plt.subplots(1, 4, figsize=(13, 3.2), layout="constrained")
 for axis, name in zip(axes, methods, strict=False):
     error = centred(integrated(methods[name], found[name][0])) - centred(height)
     axis.imshow(error[0, 0], cmap="coolwarm", vmin=-4, vmax=4)
     axis.set_title(f"error, {name}")
-jump = methods["piecewise"].solve(corrected(found["piecewise"][0])).jump
+slopes = corrected(found["piecewise"][0])
+jump = methods["piecewise"].solve(slopes, anchor=height, anchor_weight=1e-3 * known).jump
 axes[2].imshow(jump[0].amax(0), vmin=0, vmax=1)
 axes[2].set_title("jumps")
 for name, (_, losses) in found.items():

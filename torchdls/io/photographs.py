@@ -24,7 +24,8 @@ import torch
 from torch import Tensor
 
 from torchdls._checks import check_alike, check_real
-from torchdls._files import Array, atomic_file, check_output, naming, require, single_map
+from torchdls._files import Array, as_array, atomic_file, check_output, naming, require, single_map
+from torchdls.io.containers import write_npz
 from torchdls.io.fields import load_mask
 from torchdls.io.formats import SIGNATURES, read_file
 
@@ -149,8 +150,8 @@ def save_normals(
     elif path.suffix.lower() == ".npy":
         write = lambda file: np.save(file, values)  # noqa: E731
     else:
-        entries = {"normals": values, "mask": valid} | {k: v.detach().cpu().numpy() for k, v in arrays.items()}
-        write = lambda file: np.savez_compressed(file, allow_pickle=False, **entries)  # noqa: E731
+        entries = {"normals": values, "mask": valid} | {name: as_array(value) for name, value in arrays.items()}
+        write = lambda file: write_npz(file, entries)  # noqa: E731
     with atomic_file(path, overwrite) as file:
         write(file)
 
