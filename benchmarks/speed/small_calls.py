@@ -1,6 +1,7 @@
 """LeastSquares from 16^2 to 2048^2 beside SciPy in the same precision, and sweeps of patches as `unfold` lays them out.
 
-`python -m benchmarks.speed.small_calls` (two minutes; add --smoke). One thread; candidates take turns in one process,
+`OMP_NUM_THREADS=1 python -m benchmarks.speed.small_calls` (two minutes; add --smoke; SPAMS takes part where the
+environment says so). One thread; candidates take turns in one process,
 and medians of its processor time are compared. "Solve alone" is what is left of a call without `nn.Module` and the
 checks of what comes in and goes out. Writes JSON and Markdown.
 """
@@ -8,6 +9,7 @@ checks of what comes in and goes out. Writes JSON and Markdown.
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Callable
 from statistics import median
@@ -66,7 +68,9 @@ def sweep(size: int, order: Order, seconds: float) -> dict[str, Any]:
         S, _, own = residual_sweep(R.clone(), D, codes.clone(), mu, order=order)
         candidates["unfold, loops"] = lambda: soup_dil_sweep(apart, D, B, mu, order=order)
         candidates["in place, loops"] = lambda: residual_sweep(S, D, own, mu, order=order)
-    if spams := optional("spams"):
+    # Threads of SPAMS' own BLAS that idle would count as its time: 20 products in place of 4.
+    spams = optional("spams") if os.environ.get("OMP_NUM_THREADS") == "1" else None
+    if spams is not None:
         X, A, level = (np.asfortranarray(x[0].numpy()) for x in (apart, D, mu))
         candidates["SPAMS OMP"] = lambda: spams.omp(X, A, lambda1=float(level[0]) ** 2 / 2, numThreads=1)
     times = medians(candidates, seconds)
@@ -97,7 +101,7 @@ def table(rows: list[dict[str, Any]], sweeps: list[dict[str, Any]]) -> str:
         f"LeastSquares beside SciPy's cosine transforms, one thread:\n\n{markdown_table(header, lines)}\n{made}\n"
         "A sweep, in products of the dictionary with all codes: from the patches that `unfold` gives and in place as\n"
         "DLS runs it, by PyTorch alone and by compiled loops (the extra `fast`); beside it the orthogonal matching\n"
-        "pursuit of SPAMS at the same threshold, which only codes:\n\n"
+        "pursuit of SPAMS at the same threshold (with OMP_NUM_THREADS=1), which only codes:\n\n"
         f"{markdown_table(('size', 'order', 'product, ms', *names), below)}\n{made}"
     )
 
